@@ -9,16 +9,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from baselines import ekf_equations, invariant_equations
 from baselines.invariant_equations import InvariantState
+from sonar_graph.numerics import mat3
 from sonar_graph.numerics.jit import compiled
-from sonar_graph.numerics.mat3 import (
-    euler_from_rates,
-    euler_from_rotation,
-    matrix,
-    product,
-    rates_from_euler,
-    rotation_from_euler,
-    vector,
-)
 from sonar_graph.slam.models.sonar_model import locate, range_azimuth
 
 from .filters import (
@@ -55,7 +47,7 @@ def carried(filter_, state, twist, xi_motion=NO_XI):
 
 def away_from_singular(angles, twist):
     R = gtsam.Rot3.RzRyRx(angles).matrix() @ rotation(twist[:3])
-    assume(abs(euler_from_rotation(matrix(R))[1]) < 1.4)
+    assume(abs(mat3.euler_from_rotation(mat3.matrix(R))[1]) < 1.4)
 
 
 def assert_covariance(actual, expected):
@@ -185,7 +177,7 @@ def test_updates_by_a_detection_and_by_depth_are_the_textbook_s(filter_, angles,
         return (X + R @ PORT)[2:]
 
     H, H_m = derivative(height, len(zero)), derivative(lambda v: height(zero, v), 6)
-    after = filter_.corrected_by_depth(state, twist, C, vector(PORT), height(zero)[0] + 0.02, 3e-4)
+    after = filter_.corrected_by_depth(state, twist, C, mat3.vector(PORT), height(zero)[0] + 0.02, 3e-4)
     assert_corrected(filter_, after, state, H, H_m @ C @ H_m.T + 3e-4, np.array([0.02]), 1e-7)
 
 
@@ -201,13 +193,13 @@ def test_a_correction_keeps_roll_and_yaw_within_half_a_turn():
 
 @given(attitudes)
 def test_euler_angles_are_gtsam_s_and_their_rate_matrices_those_of_small_turns(angles):
-    R, E = gtsam.Rot3.RzRyRx(angles), np.array(euler_from_rates(vector(angles)))
-    assert_allclose(rotation_from_euler(vector(angles)), R.matrix(), atol=1e-14)
-    assert_allclose(euler_from_rotation(rotation_from_euler(vector(angles))), angles, atol=1e-9)
-    assert_allclose(product(matrix(E), rates_from_euler(vector(angles))), np.eye(3), atol=1e-12)
+    R, E = gtsam.Rot3.RzRyRx(angles), np.array(mat3.euler_from_rates(mat3.vector(angles)))
+    assert_allclose(mat3.rotation_from_euler(mat3.vector(angles)), R.matrix(), atol=1e-14)
+    assert_allclose(mat3.euler_from_rotation(mat3.rotation_from_euler(mat3.vector(angles))), angles, atol=1e-9)
+    assert_allclose(mat3.product(mat3.matrix(E), mat3.rates_from_euler(mat3.vector(angles))), np.eye(3), atol=1e-12)
 
     def change(turn):
-        after = euler_from_rotation(matrix(R.compose(gtsam.Rot3.Expmap(turn)).matrix()))
+        after = mat3.euler_from_rotation(mat3.matrix(R.compose(gtsam.Rot3.Expmap(turn)).matrix()))
         return unwrapped(np.array(after) - angles, 0, 1, 2)
 
     assert_allclose(E, derivative(change, 3), **close)
@@ -263,7 +255,7 @@ def gauge(axes):
 
 
 def rows_of_height_and_tilt(state, twist):
-    height = invariant_equations.height_of_body_point(state, gap_motion_of(twist), vector(PORT))[1]
+    height = invariant_equations.height_of_body_point(state, gap_motion_of(twist), mat3.vector(PORT))[1]
     return [height, *(invariant_equations.height_of_point(state, k)[1] for k in range(3))]
 
 
@@ -286,7 +278,7 @@ def test_what_is_missed_of_height_and_up_is_linear_in_the_error(angles, turn):
 
     def missed(xi):
         up = Invariant.moved(state, xi).R.T @ [0.0, 0.0, 1.0]
-        return invariant_equations.up_innovation(state, vector(up))[0]
+        return invariant_equations.up_innovation(state, mat3.vector(up))[0]
 
     assert_allclose(missed(np.zeros(15)), 0.0, atol=1e-12)
     assert_allclose(invariant_equations.up_innovation(state, direction)[1], derivative(missed, 15), atol=1e-6)

@@ -223,9 +223,6 @@ def test_causal_estimates_keep_the_later_answer_and_time_never_runs_back():
     assert said.trajectory().positions[:, 0].tolist() == [0.1, 0.3, 0.5]
 
 
-# ---------------------------------------------------------------------------------------------- detections
-
-
 @slam_filters
 def test_each_detection_has_its_outcome_and_a_refused_one_changes_nothing(kind):
     """Before the first node, without a probable identity, older than what is done, and outside the gate."""
@@ -266,9 +263,6 @@ def test_many_landmarks_stay_where_they_were_seen(kind):
     assert_array_equal(found.ids, np.arange(20))
     assert_allclose(np.arctan2(found.positions[:, 1], found.positions[:, 0]), 0.05 * np.arange(20), atol=1e-3)
     assert slam.detections().outcomes == [Outcome.NEW] * 20
-
-
-# ---------------------------------------------------------------------------------------------- missions
 
 
 @pytest.fixture(scope="module")
@@ -405,9 +399,6 @@ def test_without_a_bias_to_estimate_there_is_none_and_none_that_walks(mission):
     assert_array_equal(state.P[3:6], 0.0)
 
 
-# ---------------------------------------------------------------------------------------------- gravity, depth, plane
-
-
 @slam_filters
 @pytest.mark.parametrize("is_felt", [True, False])
 def test_gravity_tells_roll_and_pitch_and_nothing_else_does(kind, is_felt):
@@ -426,10 +417,8 @@ def test_an_accelerating_vehicle_is_not_taken_for_a_tilted_one(kind):
     seconds, acceleration = 10, 0.2
     doppler = dvl(seconds, rate_hz=10)
     velocity = np.outer((doppler.stamps_ns - T0_NS) * 1e-9, [acceleration, 0.0, 0.0])
-    rows = (
-        imu(seconds, force=GRAVITY + np.array([acceleration, 0.0, 0.0]), rate_hz=100),
-        replace(doppler, velocity=velocity),
-    )
+    force = GRAVITY + np.array([acceleration, 0.0, 0.0])
+    rows = imu(seconds, force=force, rate_hz=100), replace(doppler, velocity=velocity)
     estimate = estimate_after(kind, Calibration(start=Start(rpy_sigma_rad=(0.05, 0.05, 1e-3))), seconds, *rows)
     assert_allclose(estimate.world_T_body.rotation().rpy(), 0.0, atol=1e-6)
     assert estimate.world_T_body.translation()[0] == pytest.approx(0.5 * acceleration * seconds**2, abs=1e-6)
@@ -439,10 +428,9 @@ def test_an_accelerating_vehicle_is_not_taken_for_a_tilted_one(kind):
 def test_gravity_counts_once_an_interval_with_its_own_variance(kind):
     """At rest: after n intervals a wide prior has become ``sigma^2 / n``, sigma that of one direction."""
     seconds, noise = 10, 0.02
+    known = {"gyro_noise_density": 1e-9, "gyro_bias_sigma": 0.0, "accel_bias_sigma": 0.0}
     calibration = Calibration(
-        imu=ImuCalibration(
-            gyro_noise_density=1e-9, gyro_bias_sigma=0.0, accel_noise_density=noise, accel_bias_sigma=0.0
-        ),
+        imu=ImuCalibration(accel_noise_density=noise, **known),
         dvl=DvlCalibration(velocity_sigma_m_s=(1e-6, 1e-6, 1e-6)),
         start=Start(rpy_sigma_rad=(1.0, 1.0, 1e-3)),
     )
@@ -489,9 +477,6 @@ def test_a_pitch_of_ninety_degrees_is_an_error_in_euler_angles_only():
     assert_allclose(estimate.world_T_body.translation(), [0.0, 0.0, -0.5], atol=1e-9)
 
 
-# ---------------------------------------------------------------------------------------------- gaps of the Doppler log
-
-
 def in_a_gap(depth=None, detections=None):
     """At rest, without accelerometer; the Doppler log is silent from 2 s to 12 s and from 14 s to 24 s."""
     doppler = dvl(25)
@@ -531,14 +516,10 @@ def test_detections_in_a_gap_count_less_and_less_and_those_after_it_in_full(kind
 
 
 @slam_filters
-def test_a_logged_depth_variance_goes_before_the_calibration_s(kind):
-    heights = [
-        height_and_tilt(run(kind, in_a_gap(depths(np.array([later(1.0)]), 1.0, variance))))[0]
-        for variance in (1e6, math.nan)
-    ]
+def test_a_logged_depth_variance_goes_before_the_calibration_s_and_a_negative_one_is_an_error(kind):
+    depth_m = {variance: in_a_gap(depths(np.array([later(1.0)]), 1.0, variance)) for variance in (1e6, math.nan, -1e6)}
+    heights = [height_and_tilt(run(kind, depth_m[variance]))[0] for variance in (1e6, math.nan)]
     assert heights == pytest.approx([0.0, 1.0], abs=1e-3)
-
-
-def test_a_negative_variance_is_an_error_that_says_so():
-    with pytest.raises(EstimatorError, match=r"invariant-ekf: between \d+ and \d+ ns .* variances above zero"):
-        run(InvariantEkf, in_a_gap(depths(np.array([later(1.0)]), 0.0, -1e6)))
+    if kind is InvariantEkf:
+        with pytest.raises(EstimatorError, match=r"invariant-ekf: between \d+ and \d+ ns .* variances above zero"):
+            run(kind, depth_m[-1e6])

@@ -16,7 +16,7 @@ from baselines.filter_motion import (
     open_interval,
     up_at_node,
 )
-from baselines.filter_window import NODE, OPENED, GravityInterval, VehicleModel
+from baselines.filter_window import NODE, OPENED, GravityInterval, VehicleModel, vehicle_model
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation import odometry as node_motion
@@ -68,13 +68,18 @@ def assert_preintegrated(motion, steps, x=X):
 def assert_same_motion(motion, expected):
     """The covariance of one turned into the axes of the other, those of the node."""
     turn = np.kron(np.eye(2), np.array(motion.dR))
-    cov, rt = turn @ expected.covariance @ turn.T, np.array(motion.cov_rt)
+    cov = turn @ expected.covariance @ turn.T
     sigma = np.sqrt(np.diag(cov))
     assert_allclose(motion.dR, expected.i_T_j.rotation().matrix(), atol=1e-14)
     assert_allclose(motion.dp, expected.i_T_j.translation(), atol=1e-14)
     assert_allclose(motion.impulse, expected.mean_specific_force * expected.duration_s, rtol=1e-12)
-    own = np.block([[np.array(motion.cov_tt), rt.T], [rt, np.array(motion.cov_rr)]])
-    assert_allclose(own / np.outer(sigma, sigma), cov / np.outer(sigma, sigma), atol=1e-12)
+    assert_allclose(whole(motion) / np.outer(sigma, sigma), cov / np.outer(sigma, sigma), atol=1e-12)
+
+
+def whole(motion) -> np.ndarray:
+    """Covariance of [theta_i, eps]."""
+    rt = np.array(motion.cov_rt)
+    return np.block([[np.array(motion.cov_tt), rt.T], [rt, np.array(motion.cov_rr)]])
 
 
 def test_motion_to_a_node_is_the_preintegrated_one(odometry):
@@ -92,21 +97,15 @@ def instants(odometry):
     return [(int(odometry.newest_node(0, until)), until) for until in np.sort(stamps).tolist()]
 
 
-def test_a_running_motion_is_the_preintegrated_one(odometry):
+def test_a_running_motion_is_the_preintegrated_one_and_to_the_last_bit_the_one_from_the_node(odometry):
     """From one instant to the next, across nodes and DVL rows that come before they are nodes."""
     columns, running, waiting = odometry.columns(), no_provisional_motion(), 0
     for node_ns, until_ns in instants(odometry):
         running, motion = motion_since_node(columns, VEHICLE, X, running, node_ns, until_ns)
         assert_preintegrated(motion, odometry.steps_since_node(node_ns, until_ns))
+        assert motion == motion_since_node(columns, VEHICLE, X, no_provisional_motion(), node_ns, until_ns)[1]
         waiting += columns[3][running.dvl_rows - 1] > node_ns
     assert waiting > 3
-
-
-def test_a_running_motion_is_the_same_to_the_last_bit_as_one_from_the_node(odometry):
-    columns, running = odometry.columns(), no_provisional_motion()
-    for node_ns, until_ns in instants(odometry):
-        running, motion = motion_since_node(columns, VEHICLE, X, running, node_ns, until_ns)
-        assert motion == motion_since_node(columns, VEHICLE, X, no_provisional_motion(), node_ns, until_ns)[1]
 
 
 def test_a_running_motion_begins_anew_when_the_attitude_that_turns_the_earth_rate_has_changed(odometry):
@@ -115,12 +114,6 @@ def test_a_running_motion_begins_anew_when_the_attitude_that_turns_the_earth_rat
     _, motion = motion_since_node(columns, VEHICLE, turned, running, node_ns, until_ns)
     assert_preintegrated(motion, odometry.steps_since_node(node_ns, until_ns), turned)
     assert np.abs(np.array(before.dR) - np.eye(3)).max() > 1e-3
-
-
-def whole(motion) -> np.ndarray:
-    """Covariance of [theta_i, eps]."""
-    rt = np.array(motion.cov_rt)
-    return np.block([[np.array(motion.cov_tt), rt.T], [rt, np.array(motion.cov_rr)]])
 
 
 def test_measurements_over_one_gap_tell_ever_nearer_what_one_exact_one_would_and_never_more():
@@ -154,9 +147,12 @@ def lost(rate_error=(0.0, 0.0, 0.0), calibration=None):
     return rows
 
 
+IMU_PLACE = (0.3, 0.1, -0.2)
+
+
 def calibration_with_gaps(gap_s=0.5):
     return Calibration(
-        imu=ImuCalibration(mounting=Mounting(translation_m=(0.3, 0.1, -0.2)), gyro_noise_density=GYRO_DENSITY),
+        imu=ImuCalibration(mounting=Mounting(translation_m=IMU_PLACE), gyro_noise_density=GYRO_DENSITY),
         dvl=DvlCalibration(mounting=Mounting(translation_m=LEVER), gap_s=gap_s),
     )
 
@@ -274,6 +270,15 @@ def test_an_interval_begins_with_the_velocity_of_the_imu_s_point(dvl_ns, hold_pa
     assert_allclose(interval.velocity[:3], VELOCITIES[0] + np.cross(expected_rate, IMU_LEVER), atol=1e-12)
     assert interval.velocity[3] == pytest.approx(1e-3)
     assert clock[1] == dvl_ns[0]
+
+
+def test_the_arm_from_dvl_to_imu_is_that_of_a_turning_rigid_body():
+    """From the calibration's mountings: both points move as ``v + w x p`` says."""
+    v, imu_ns, dvl_ns = np.array([0.4, -0.2, 0.1]), T0_NS + np.array([0, 100, 200, 300]), T0_NS + np.array([100, 290])
+    interval, clock = an_interval(), np.array([dvl_ns[0], 0, 0, 0])
+    columns = columns_of(imu_ns, dvl_ns, velocities=np.array([v + np.cross(RATES[1], LEVER)] * 2))
+    open_interval(columns, vehicle_model(calibration_with_gaps(), 1.0).dvl_p_imu, interval, clock)
+    assert_allclose(interval.velocity[:3], v + np.cross(RATES[1], IMU_PLACE), atol=1e-12)
 
 
 @compiled

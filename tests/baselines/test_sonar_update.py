@@ -5,17 +5,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from baselines import sonar_update
 from baselines.ekf_slam import EkfSlam
 from baselines.filter_window import LOST
 from baselines.invariant_ekf import InvariantEkf
-from baselines.sonar_update import (
-    GATED,
-    USED,
-    SonarModel,
-    far_polar_covariance,
-    is_beyond_linear,
-    range_azimuth_jacobian,
-)
+from sonar_graph.numerics.jit import compiled
 from sonar_graph.numerics.mat3 import IDENTITY, ZERO
 from sonar_graph.sequence import NS_PER_S, Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
@@ -24,7 +18,9 @@ from sonar_graph.slam.landmarks.association import gate_threshold
 from .filters import LEVEL, both, derivative, observed, rotation
 
 APERTURE_RAD = 0.3
-SONAR = SonarModel(IDENTITY, ZERO, gate_threshold(0.999, 2), APERTURE_RAD, 0.02**2, 0.01**2, False, 0.0, 1.0)
+SONAR = sonar_update.SonarModel(
+    IDENTITY, ZERO, gate_threshold(0.999, 2), APERTURE_RAD, 0.02**2, 0.01**2, False, 0.0, 1.0
+)
 LANDMARK = np.array([25.0, 12.0, -1.0])
 BEFORE_S, LOST_S = 25.0, 120.0
 AFTER_S = np.array([3.0, 10.0, 20.0])
@@ -58,7 +54,7 @@ def test_one_look_finds_a_vehicle_that_is_far_from_where_it_was_expected(filter_
     """And linearised where it was expected it is sure of a wrong place."""
     X = np.array([40.0, 20.0, -0.5])
     outcome, at, P, _, S = look(filter_, X, 30.0, was_lost=True)
-    assert outcome == USED
+    assert outcome == sonar_update.USED
     assert np.linalg.norm((at - X)[:2]) < 0.5
     assert (at - X) @ np.linalg.solve(P, at - X) < chi2.ppf(0.99, 3)
     assert S[0, 0] == pytest.approx(30.0**2, rel=0.01)
@@ -77,17 +73,34 @@ def test_a_vehicle_near_where_it_was_expected_sees_as_without_a_gap(filter_):
 @both
 def test_what_no_vehicle_in_reach_sees_is_refused(filter_):
     outcome, at, _, innovation, S = look(filter_, np.array([40.0, 20.0, -0.5]), 30.0, True, wrong_m=300.0)
-    assert outcome == GATED
+    assert outcome == sonar_update.GATED
     assert at.tolist() == [0.0, 0.0, 0.0]
     assert innovation @ np.linalg.solve(S, innovation) > SONAR.gate
 
 
-def test_the_noise_of_a_view_holds_that_of_many_beams():
+def test_the_noise_of_a_view_holds_that_of_many_beams_and_without_aperture_is_the_detection_s():
     """Of elevations anywhere in the aperture, for a length that is taken at elevation zero."""
     elevation = np.random.default_rng(3).uniform(-APERTURE_RAD / 2, APERTURE_RAD / 2, 200_000)
-    V = far_polar_covariance(40.0, (0.0, 0.0, 0.0), APERTURE_RAD)
+    V = sonar_update.far_polar_covariance(40.0, (0.0, 0.0, 0.0), APERTURE_RAD)
     assert V[0, 0] == pytest.approx(np.mean(np.square(40.0 * (1 - np.cos(elevation)))), rel=0.02)
     assert V[2, 2] == pytest.approx(np.var(elevation), rel=0.02)
+    V = sonar_update.far_polar_covariance(40.0, (0.04, -0.003, 0.0009), 0.0)
+    np.testing.assert_array_equal(V, [[0.04, -0.003, 0.0], [-0.003, 0.0009, 0.0], [0.0, 0.0, 0.0]])
+
+
+@compiled
+def is_inside(seen, sonar):
+    return sonar_update.is_inside_gate(seen, sonar)
+
+
+@pytest.mark.parametrize("direction", [(2.0, 1.0), (2.0, -1.0), (1.0, 0.0)])
+def test_the_gate_is_an_ellipse_of_a_correlated_innovation(direction):
+    """Range and azimuth correlated by 0.9: along the long axis far more passes than across it."""
+    S = np.array([[4.0, 1.8], [1.8, 1.0]])
+    e = np.array(direction) * np.sqrt(SONAR.gate / (direction @ np.linalg.solve(S, direction)))
+    for share, expected in ((0.999, True), (1.001, False)):
+        seen = sonar_update.DetectionRow(0, (1.0, 0.0), (1.0, 0.0, 1.0), share * e, S)
+        assert is_inside(seen, SONAR) == expected
 
 
 def test_linear_is_what_errs_by_less_than_the_noise():
@@ -95,38 +108,27 @@ def test_linear_is_what_errs_by_less_than_the_noise():
     G_z = np.diag([1.0, 10.0, 10.0])
     across = np.diag([0.0, 1.0, 0.0])
     longer_m = np.hypot(10.0, 1.0) - 10.0
-    assert not is_beyond_linear(across, G_z, 10.0, ((1.05 * longer_m) ** 2, 0.0, 1.0))
-    assert is_beyond_linear(across, G_z, 10.0, ((0.95 * longer_m) ** 2, 0.0, 1.0))
+    assert not sonar_update.is_beyond_linear(across, G_z, 10.0, ((1.05 * longer_m) ** 2, 0.0, 1.0))
+    assert sonar_update.is_beyond_linear(across, G_z, 10.0, ((0.95 * longer_m) ** 2, 0.0, 1.0))
     both = np.diag([1.0, 1.0, 0.0])
-    assert not is_beyond_linear(both, G_z, 10.0, (1.0, 0.0, 0.0101**2))
-    assert is_beyond_linear(both, G_z, 10.0, (1.0, 0.0, 0.0099**2))
-    assert not is_beyond_linear(1e6 * np.diag([0.0, 0.0, 1.0]), G_z, 10.0, (1e-4, 0.0, 1e-4))
-    np.testing.assert_allclose(range_azimuth_jacobian(G_z, 10.0) @ [0.3, 0.2, 5.0], [0.3, 0.02])
+    assert not sonar_update.is_beyond_linear(both, G_z, 10.0, (1.0, 0.0, 0.0101**2))
+    assert sonar_update.is_beyond_linear(both, G_z, 10.0, (1.0, 0.0, 0.0099**2))
+    assert not sonar_update.is_beyond_linear(1e6 * np.diag([0.0, 0.0, 1.0]), G_z, 10.0, (1e-4, 0.0, 1e-4))
+    np.testing.assert_allclose(sonar_update.range_azimuth_jacobian(G_z, 10.0) @ [0.3, 0.2, 5.0], [0.3, 0.02])
 
 
 TURNED = Rotation.from_euler("xyz", [0.4, -0.7, 1.9]).as_matrix()
 
 
-def test_the_noise_of_a_view_is_the_detections_where_the_aperture_is_none():
-    V = far_polar_covariance(40.0, (0.04, -0.003, 0.0009), 0.0)
-    np.testing.assert_array_equal(V, [[0.04, -0.003, 0.0], [-0.003, 0.0009, 0.0], [0.0, 0.0, 0.0]])
-
-
 @pytest.mark.parametrize("range_m", [10.0, 3.0])
-def test_a_shift_is_the_same_in_range_and_azimuth_wherever_the_sonar_points(range_m):
-    """A left inverse of the derivative by range and azimuth, blind to elevation."""
-    G_z = TURNED @ np.diag([1.0, range_m, range_m])
-    np.testing.assert_allclose(range_azimuth_jacobian(G_z, range_m) @ G_z, np.eye(2, 3), atol=1e-12)
-
-
-@pytest.mark.parametrize("range_m", [10.0, 3.0])
-def test_what_is_linear_does_not_depend_on_where_the_sonar_points(range_m):
-    """By (1) with 0.3 m along and 0.2 m across: two per cent of the sigma on either side."""
+def test_a_shift_and_what_is_linear_are_the_same_wherever_the_sonar_points(range_m):
+    """A left inverse of the derivative, blind to elevation; (1) with 0.3 m along and 0.2 m across, 2 % on each side."""
     G_z, cov = TURNED @ np.diag([1.0, range_m, range_m]), TURNED @ np.diag([0.09, 0.04, 4.0]) @ TURNED.T
+    np.testing.assert_allclose(sonar_update.range_azimuth_jacobian(G_z, range_m) @ G_z, np.eye(2, 3), atol=1e-12)
     longer_m, turned_rad = 0.04 / (2 * range_m), 0.3 * 0.2 / range_m**2
     for share, is_beyond in ((0.98, True), (1.02, False)):
-        assert is_beyond_linear(cov, G_z, range_m, ((share * longer_m) ** 2, 7.0, 9.0)) == is_beyond
-        assert is_beyond_linear(cov, G_z, range_m, (9.0, 7.0, (share * turned_rad) ** 2)) == is_beyond
+        assert sonar_update.is_beyond_linear(cov, G_z, range_m, ((share * longer_m) ** 2, 7.0, 9.0)) == is_beyond
+        assert sonar_update.is_beyond_linear(cov, G_z, range_m, (9.0, 7.0, (share * turned_rad) ** 2)) == is_beyond
 
 
 def nees_after_gap(kind, seed, forgets_gap):

@@ -7,7 +7,7 @@ import signal
 import tempfile
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,6 @@ from .conftest import BASIN, DEAD_RECKONING, HEADER
 
 LIMITS = Limits(600.0)
 HERE = Where(1)
-Interrupted = KeyboardInterrupt
 
 
 class Killed(BaseException):
@@ -82,11 +81,11 @@ def test_resumed_batch_has_the_table_of_an_undisturbed_one(suite, tmp_path, in_t
     def interrupted(runs: list[PlannedRun], store: Store, *_others: Any) -> None:
         do_here(runs[:1], store)
         done.append(runs[0].key)
-        raise Interrupted
+        raise KeyboardInterrupt
 
     for count in (1, 2, 3):
         monkeypatch.setattr(cluster, "run_batch", interrupted)
-        with Batch.opened(read_suite(suite), tmp_path / "b") as batch, pytest.raises(Interrupted):
+        with Batch.opened(read_suite(suite), tmp_path / "b") as batch, pytest.raises(KeyboardInterrupt):
             batch.run(HERE, LIMITS, nobody)
         statuses = [row["status"] for row in table(tmp_path / "b")]
         assert statuses == ["ok"] * count + ["not run"] * (4 - count)
@@ -202,8 +201,8 @@ def test_second_batch_in_a_folder_is_refused_and_touches_nothing(suite, tmp_path
         assert not half_written.exists()
 
 
-def killed_after(count: int) -> Callable[..., None]:
-    """In place of `run_batch`: some runs are done and told, and then the process is gone."""
+def kill(suite: Path, folder: Path, count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Some runs are done and told, and then the process is gone."""
 
     def killed(runs: list[PlannedRun], store: Store, _limits: Limits, _where: Where, progress: Progress) -> None:
         for run in runs[:count]:
@@ -211,11 +210,7 @@ def killed_after(count: int) -> Callable[..., None]:
             progress(run, RunOutcome({"status": "ok"}))
         raise Killed
 
-    return killed
-
-
-def kill(suite: Path, folder: Path, count: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cluster, "run_batch", killed_after(count))
+    monkeypatch.setattr(cluster, "run_batch", killed)
     with Batch.opened(read_suite(suite), folder) as batch, pytest.raises(Killed):
         batch.run(HERE, LIMITS, nobody)
 

@@ -130,9 +130,7 @@ def test_landmarks_on_a_log_are_those_of_the_seed(planned, tmp_path, monkeypatch
 
 
 def map_of(sequence: Sequence) -> list[list[float]]:
-    assert sequence.true_landmarks is not None
-    positions: list[list[float]] = sequence.true_landmarks.positions.tolist()
-    return positions
+    return sequence.true_landmarks.positions.tolist()
 
 
 def test_other_versions_than_planned_and_a_folder_that_cannot_be_written_are_no_result(planned, tmp_path):

@@ -75,13 +75,8 @@ def drawn(rng: np.random.Generator, seeds: int, *, lost: float, worse: float = 0
     errors = rng.normal(0, 0.1, (2, 3, 2, seeds)) + math.log(100) * (rng.random((2, 3, 2, seeds)) < lost)
     ratios = errors[1] - errors[0]
     ratios[0] += math.log1p(worse)
-    return with_all_logs(
-        {
-            (f"log {n}", f"contestant {c}", "error"): dict(enumerate(ratios[c, n].tolist()))
-            for c in range(3)
-            for n in range(2)
-        }
-    )
+    groups = {(f"log {n}", f"contestant {c}", "error"): ratios[c, n] for c in range(3) for n in range(2)}
+    return with_all_logs({group: dict(enumerate(values.tolist())) for group, values in groups.items()})
 
 
 def share_of_failures(seeds: int, *, lost: float, worse: float = 0.0, batches: int = 150) -> float:

@@ -54,10 +54,7 @@ def test_a_run_that_did_not_end_is_not_left_out_and_has_no_value_whatever_is_rec
         assert np.isinf(own).tolist() == [True] * count + [False] * (6 - count)
         assert np.isfinite(reference).all()
     assert not batch.is_asked(LOGS[0], "isam2", "depth_m"), "nobody has it"
-
-
-def test_a_score_that_a_contestant_never_has_is_no_failure():
-    batch = drawn_batch(3)
+    batch = drawn_batch(3)  # a score that a contestant never has is no failure
     assert not batch.is_asked(LOGS[0], "dead-reckoning", MAP)
     assert batch.is_asked(LOGS[0], "isam2", MAP)
     assert len(batch.pairs(LOGS[0], "isam2", MAP)[0]) == 0

@@ -18,6 +18,10 @@ OUTCOME = RunOutcome(
 )
 
 
+class Died(BaseException):
+    """Ends a process."""
+
+
 def names(folder: Path) -> list[str]:
     return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
 
@@ -58,9 +62,6 @@ def test_full_disk_leaves_nothing_of_the_run_and_all_of_the_others(tmp_path, mon
 def test_process_that_dies_before_the_rename_leaves_no_run(tmp_path, monkeypatch):
     store = Store(tmp_path)
 
-    class Died(BaseException):
-        pass
-
     def die(_self: Path, _target: Path) -> None:
         raise Died
 
@@ -80,9 +81,6 @@ def test_process_that_dies_while_it_removes_a_run_leaves_it_whole_or_not_at_all(
     store = Store(tmp_path)
     store.write("k", OUTCOME)
     whole = names(store.run_folder("k"))
-
-    class Died(BaseException):
-        pass
 
     def die(folder: Path, **_options: Any) -> None:
         next(path for path in folder.rglob("*.npz")).unlink()
@@ -126,7 +124,6 @@ with only_batch_in(Path(sys.argv[1])):
 
 def test_second_process_is_refused_until_the_first_is_killed_although_its_children_live(tmp_path):
     with subprocess.Popen([sys.executable, "-c", HOLDER, str(tmp_path)], stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
         child = int(process.stdout.readline())
         try:
             with pytest.raises(BatchError) as refused, only_batch_in(tmp_path):

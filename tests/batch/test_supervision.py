@@ -126,7 +126,6 @@ def test_process_of_runs_does_not_outlive_who_started_it():
         "print(Runner().pid, flush=True); time.sleep(1000)"
     )
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as starter:
-        assert starter.stdout is not None
         runner = psutil.Process(int(starter.stdout.readline()))
         starter.kill()
     assert runner.wait(timeout=30) is None

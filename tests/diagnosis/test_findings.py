@@ -132,7 +132,6 @@ def test_a_rest_at_the_start_is_used_as_long_as_it_lasts(rest_s: float, used: in
     assert found.said == f"from {used} s of rest"
     assert_tilt(found, (ROLL, PITCH))
     bias = found.gyro_bias()
-    assert bias is not None
     for one, true in zip(bias, BIAS, strict=True):
         assert abs(one.value - true) < 4 * one.sigma < 4 * 1.2e-4
 
@@ -164,7 +163,8 @@ def test_a_start_that_contradicts_is_named_with_the_line_that_puts_it_right():
         assert not any(row.acts for row in tilt_findings(found, fits, 0.9))
 
 
-def test_without_accelerometers_one_row_says_why_there_is_no_tilt():
+def test_what_speaks_against_both_ways_is_said_in_one_row():
+    """No accelerometers; velocities that have nothing to do with the accelerations; a calibration without noise."""
     run = resting(50.0)
     blind = replace(run, imu=Imu(run.imu.stamps_ns, run.imu.angular_velocity, np.full((len(run.imu), 3), np.nan)))
     found = find_start_tilt(blind)
@@ -173,13 +173,9 @@ def test_without_accelerometers_one_row_says_why_there_is_no_tilt():
     assert row.text().startswith("cannot be told: at rest: Imu.specific_force")
     assert "in motion: Imu.specific_force" in row.text()
     assert not row.acts
-
-
-def test_what_speaks_against_both_ways_is_said():
-    """Velocities that have nothing to do with the accelerations."""
     run = resting(4.0)
-    rng = np.random.default_rng(0)
-    wild = Dvl(run.dvl.stamps_ns, rng.standard_normal((len(run.dvl), 3)), run.dvl.velocity_cov)
+    velocity = np.random.default_rng(0).standard_normal((len(run.dvl), 3))
+    wild = Dvl(run.dvl.stamps_ns, velocity, run.dvl.velocity_cov)
     found = find_start_tilt(replace(run, dvl=wild))
     assert found == StartTilt(None, found.said)
     assert "at rest: Imu.specific_force: varies" in found.said

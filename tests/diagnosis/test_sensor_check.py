@@ -9,15 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration
+from sonar_graph.diagnosis import sensor_check
 from sonar_graph.diagnosis.findings import Finding, StartTilt, find_start_tilt
-from sonar_graph.diagnosis.sensor_check import (
-    check_sensors,
-    corrected_sequence,
-    dvl_findings,
-    noise_findings,
-    surest_bias,
-    wrong_units,
-)
 from sonar_graph.logs.adapters.log_config import LogConfig
 from sonar_graph.measurements import Dvl, Floats, Imu
 from sonar_graph.navigation.alignment.dvl_imu import DvlMatch
@@ -55,7 +48,7 @@ def spoilt() -> Sequence:
 
 @pytest.fixture(scope="module")
 def found_in_spoilt() -> dict[str, Finding]:
-    return by_name(check_sensors(spoilt()))
+    return by_name(sensor_check.check_sensors(spoilt()))
 
 
 def with_mounting(run: Sequence, sensor: str, **change: tuple[float, ...]) -> Sequence:
@@ -93,7 +86,7 @@ def corrected(run: Sequence, found: dict[str, Finding]) -> Sequence:
 @pytest.mark.slow
 def test_the_advised_lines_put_the_log_right(found_in_spoilt: dict[str, Finding]):
     found = found_in_spoilt
-    again = by_name(check_sensors(corrected(spoilt(), found)))
+    again = by_name(sensor_check.check_sensors(corrected(spoilt(), found)))
     for name in ("DVL against IMU: time offset", "DVL mounting yaw", "DVL scale"):
         assert found[name].acts, name
         assert not again[name].acts, again[name].text()
@@ -115,13 +108,13 @@ def test_the_start_is_aligned_with_what_was_found_before(found_in_spoilt: dict[s
 
 def test_corrections_are_added_to_what_the_configuration_says_and_a_wrong_unit_is_named_alone():
     config = LogConfig.parse({"dvl": {"stamp_offset_s": -0.1, "scale": 2.0}}, "x")
-    found = by_name(check_sensors(spoilt(), config))
+    found = by_name(sensor_check.check_sensors(spoilt(), config))
     offset, scale = (line_of(found[name]) for name in ("DVL against IMU: time offset", "DVL scale"))
     assert offset["stamp_offset_s"] == pytest.approx(OFFSET_S - 0.1, abs=0.15)
     assert scale["scale"] == pytest.approx(2 * SCALE, abs=0.05)
     dvl = RIGHT.dvl
     in_mm = replace(RIGHT, dvl=Dvl(dvl.stamps_ns, dvl.velocity * 1000.0, dvl.velocity_cov))
-    (finding,) = check_sensors(in_mm, config)
+    (finding,) = sensor_check.check_sensors(in_mm, config)
     assert (finding.quantity, finding.acts, line_of(finding)) == ("DVL: unit", True, {"scale": 0.002})
 
 
@@ -132,21 +125,21 @@ def test_a_start_taken_from_a_late_reference_is_named_with_the_right_one():
     turning = replace(SHORT, truth=late, imu=SHORT.imu.rows(is_left))
     for reference, acts in ((late, True), (SHORT.truth, False)):
         run = started_at(turning, *start_of(turning, reference))
-        finding = by_name(check_sensors(run))["start heading: error"]
+        finding = by_name(sensor_check.check_sensors(run))["start heading: error"]
         assert finding.acts == acts, finding.text()
         assert ("(--calibration FILE); the position too is the reference's" in finding.advice) == acts
 
 
 def test_lines_for_the_start_agree_on_roll_pitch_and_heading():
     roll, pitch, yaw = start_of(SHORT, SHORT.truth)
-    found = by_name(check_sensors(started_at(SHORT, roll + 0.1, pitch, yaw + 0.2)))
+    found = by_name(sensor_check.check_sensors(started_at(SHORT, roll + 0.1, pitch, yaw + 0.2)))
     ours, theirs = (line_of(found[name])["start"] for name in ("start roll: value", "start heading: error"))
     assert ours["rpy_rad"] == theirs["rpy_rad"] == pytest.approx([roll, pitch, yaw], abs=2e-3)
 
 
 def test_a_number_that_cannot_be_told_asks_for_nothing():
     short = replace(RIGHT, imu=RIGHT.imu.rows(slice(0, 150)), dvl=RIGHT.dvl.rows(slice(0, 9)), truth=None)
-    for finding in check_sensors(short):
+    for finding in sensor_check.check_sensors(short):
         assert not finding.acts
         assert finding.text().startswith("cannot be told: ")
         assert finding.plain()["value"] is None
@@ -158,12 +151,12 @@ def test_a_hole_of_the_imu_asks_for_nothing(hole_s: float, monkeypatch: pytest.M
     """Drawn straight across, 5 s of manoeuvres make a wrong scale and a wrong offset of the reference."""
     t = (RIGHT.imu.stamps_ns - RIGHT.imu.stamps_ns[0]) * 1e-9
     run = replace(RIGHT, imu=RIGHT.imu.rows((t <= 100.0) | (t >= 100.0 + hole_s)))
-    found = by_name(check_sensors(run))
+    found = by_name(sensor_check.check_sensors(run))
     assert [finding.text() for finding in found.values() if finding.acts] == []
     assert found["DVL scale"].estimate.is_known
     assert found["reference against IMU: time offset"].estimate.is_known
     monkeypatch.setattr("sonar_graph.navigation.alignment.dvl_imu.holes_before", np.zeros_like)
-    blind = by_name(check_sensors(run))
+    blind = by_name(sensor_check.check_sensors(run))
     assert blind["DVL scale"].acts == blind["reference against IMU: time offset"].acts == (hole_s > 2.0)
 
 
@@ -172,7 +165,7 @@ def test_a_steady_drive_is_no_rest_to_tell_noise_from(speed_m_s: float, is_told:
     rng, n = np.random.default_rng(0), 5000
     force, rate = 0.05 * rng.standard_normal((n, 3)), 0.01 * rng.standard_normal((n, 3))
     velocity = [speed_m_s, 0, 0] + 0.01 * rng.standard_normal((250, 3))
-    found = by_name(check_sensors(with_rows(rate, force, velocity)))
+    found = by_name(sensor_check.check_sensors(with_rows(rate, force, velocity)))
     for name in ("gyro noise density", "accelerometer noise density"):
         assert found[name].estimate.is_known == found[name].acts == is_told
         assert is_told or "steady, but at 0.8 m/s" in found[name].text()
@@ -184,7 +177,7 @@ def test_a_density_matters_by_half_as_much_again_either_way(factor: float, acts:
     rng, n, given = np.random.default_rng(1), 10_000, RIGHT.calibration.imu
     rate, force = factor * 10 * rng.standard_normal((2, n, 3))
     run = with_rows(given.gyro_noise_density * rate, given.accel_noise_density * force, np.zeros((500, 3)))
-    for finding in noise_findings(run):
+    for finding in sensor_check.noise_findings(run):
         assert finding.acts == acts, finding.text()
 
 
@@ -199,10 +192,10 @@ def test_what_is_corrected_before_the_start_is_what_the_rows_advise(acts: bool):
     numbers = (Estimate1D(value, 1e-5) for value in (offset, yaw, scale))
     match = DvlMatch(*numbers, lever=told(-0.2, 0.0, -0.15), gyro_bias=told(0.0, 0.0, 0.0, sigma=1e-6))
     turned = with_mounting(RIGHT, "dvl", rpy_rad=(0.3, 0.1, 0.2))
-    rows = list(dvl_findings(match, turned, LogConfig()))
+    rows = list(sensor_check.dvl_findings(match, turned, LogConfig()))
     assert [row.acts for row in rows] == [acts] * 3
     assert rows[0].estimate.sigma == pytest.approx(0.01 / np.sqrt(12), rel=1e-3), "that of a sample's instant"
-    right = corrected_sequence(turned, match, rows)
+    right = sensor_check.corrected_sequence(turned, match, rows)
     assert right.dvl.stamps_ns - RIGHT.dvl.stamps_ns == pytest.approx(400_000_000 if acts else 0)
     assert right.dvl.velocity == pytest.approx(RIGHT.dvl.velocity * (1.04 if acts else 1.0))
     assert right.calibration.dvl.mounting.rpy_rad == pytest.approx((0.3, 0.1, 0.25 if acts else 0.2))
@@ -215,10 +208,10 @@ def test_of_two_biases_the_surer_is_told_axis_by_axis_with_where_it_is_from():
     drive = DvlMatch(unknown, unknown, unknown, nothing, (x, replace(y, sigma=1e-2), unknown))
     sigmas = np.array([1.0, 1.0, 1e-3, 1e-3, 1e-3])
     rest = InitialTilt(0, 0.0, 0.0, np.array([10.0, 20.0, 30.0]), np.diag(sigmas**2), np.ones(3, dtype=np.bool_))
-    bias, sources = surest_bias(drive, StartTilt(rest, "from 20 s of rest", is_rest=True))
+    bias, sources = sensor_check.surest_bias(drive, StartTilt(rest, "from 20 s of rest", is_rest=True))
     assert [one.value for one in bias] == [1.0, 20.0, 30.0]
     assert sources == ("from the turns of the drive", "from 20 s of rest", "from 20 s of rest")
-    moving, sources = surest_bias(drive, StartTilt(rest, "from 60 s in motion"))
+    moving, sources = sensor_check.surest_bias(drive, StartTilt(rest, "from 60 s in motion"))
     assert moving == drive.gyro_bias
     assert set(sources) == {"from the turns of the drive"}
 
@@ -240,7 +233,7 @@ def units(
     stamps_ns, forces = np.arange(N) * 10_000_000, force if np.ndim(force) == 2 else vectors(force)
     imu, dvl = Imu(stamps_ns, vectors(turn), forces), Dvl(stamps_ns, vectors(speed), np.full((N, 3, 3), np.nan))
     sequence = Sequence("hand", Calibration(gravity_m_s2=gravity), imu, dvl)
-    return wrong_units(sequence, LogConfig.parse(scales, "x"))
+    return sensor_check.wrong_units(sequence, LogConfig.parse(scales, "x"))
 
 
 # fmt: off
@@ -296,14 +289,11 @@ def test_what_the_configuration_scales_is_taken_over():
     assert force == pytest.approx({"linear_acceleration_scale": 19.6133})
 
 
-def test_a_twentieth_of_spikes_counts_for_nothing_and_more_does():
+def test_a_twentieth_of_spikes_and_rows_that_were_not_measured_in_full_count_for_nothing():
+    """A vector without one component looks shorter than it is; without any row there is nothing to say."""
     few, many = (np.where(np.arange(N) < k, 1e4, 0.1) for k in (4, 7))
     assert not units(speed=few, turn=few)
     assert [fault.quantity for fault in units(speed=many, turn=many)] == ["DVL: unit", "gyro: unit"]
-
-
-def test_rows_that_were_not_measured_in_full_do_not_count():
-    """A vector without one component looks shorter than it is; without any row there is nothing to say."""
     force = vectors(9.8).copy()
     force[: N - 10] = [np.nan, 0.0, 1.0]
     assert not units(force=force)

@@ -85,10 +85,17 @@ class Offset:
         )
 
 
+class Broken(Offset):
+    """Fails at once."""
+
+    def process(self, _measurements: Measurements) -> Estimate | None:
+        raise RuntimeError("diverged")
+
+
 @pytest.fixture
 def install(monkeypatch) -> Callable[..., None]:
-    """Make classes known as estimators, beside ``offset``: ``install(name=Class)``."""
-    installed: dict[str, Any] = {"offset": Offset}
+    """Make classes known as estimators, beside ``offset`` and ``broken``: ``install(name=Class)``."""
+    installed: dict[str, Any] = {"offset": Offset, "broken": Broken}
 
     def load(name: str) -> Any:
         if name not in installed:

@@ -1,48 +1,41 @@
 """Logs with images as they come from real dives: damaged, cut off, with a window that changes, with two sonars."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
 from sonar_graph.errors import LogError, MissingTopicError
 from sonar_graph.logs.mcap.file_summary import Instant, TimeWindow
-from sonar_graph.logs.mcap.writer import Outgoing
 from sonar_graph.logs.reading import read_log
 from sonar_graph.logs.writing import sonar_image_messages, write_log
 from sonar_graph.measurements import SonarFrames
 from sonar_graph.recognition.recognition_record import Recognition
 from sonar_graph.recognition.session import LEAPT, NO_FLOOR, recognise_images
+from tests.recognition.imaged_lane import TOPIC, Lane
 
-if TYPE_CHECKING:
-    from tests.recognition.imaged_lane import Lane
-
-
-TOPIC = "/sonar/image"
 COUNT = 70
 SECONDS = 10**9
-
-
-def message(frame: SonarFrames, topic: str = TOPIC, recorded_ns: int | None = None) -> Outgoing:
-    entry = sonar_image_messages(topic, frame)
-    return entry if recorded_ns is None else replace(entry, log_times_ns=np.array([recorded_ns]))
 
 
 def frames_of(lane: Lane) -> list[SonarFrames]:
     return [lane.one(k) for k in range(COUNT)]
 
 
-def recognised(lane: Lane, log: Path, messages: list[Outgoing], **settings: object) -> Recognition:
+def write(lane: Lane, log: Path, frames: list[SonarFrames] | None = None, **changes: object) -> Path:
+    """A log with frames; changes are of message 30."""
+    messages = [sonar_image_messages(TOPIC, frame) for frame in frames or frames_of(lane)]
+    if changes:
+        messages[30] = replace(messages[30], **changes)
     write_log(log, lane.sequence, messages)
-    salvage = {"salvage": settings["salvage"]} if "salvage" in settings else {}
-    found = recognise_images(log, read_log(log, **salvage), **settings)
-    assert found is not None
-    return found
+    return log
+
+
+def recognised(lane: Lane, folder: Path, frames: list[SonarFrames] | None = None, **changes: object) -> Recognition:
+    log = write(lane, folder / "log.mcap", frames, **changes)
+    return recognise_images(log, read_log(log))
 
 
 def cropped(frame: SonarFrames, bins: int) -> SonarFrames:
@@ -56,12 +49,12 @@ def sure(found: Recognition) -> set[int]:
 
 @pytest.fixture(scope="module")
 def plain(lane, tmp_path_factory) -> Recognition:
-    return recognised(lane, tmp_path_factory.mktemp("plain") / "log.mcap", [message(f) for f in frames_of(lane)])
+    return recognised(lane, tmp_path_factory.mktemp("plain"))
 
 
 def test_a_window_that_changes_costs_one_frame_and_tracks_go_on(lane, tmp_path, plain):
     frames = [cropped(f, 450) if 20 <= k < 45 else f for k, f in enumerate(frames_of(lane))]
-    found = recognised(lane, tmp_path / "log.mcap", [message(f) for f in frames])
+    found = recognised(lane, tmp_path, frames)
     stamps = [int(frames[k].stamps_ns[0]) for k in (20, 21, 45)]
     assert [stamp for stamp, _ in found.warnings] == stamps
     words = ["used if it comes again", "window changed: 96 x 450", "window changed: 96 x 512"]
@@ -74,26 +67,23 @@ def test_a_window_that_changes_costs_one_frame_and_tracks_go_on(lane, tmp_path, 
 
 def test_two_windows_in_turn_are_both_used(lane, tmp_path, plain):
     frames = [cropped(f, 450) if k % 2 else f for k, f in enumerate(frames_of(lane))]
-    found = recognised(lane, tmp_path / "log.mcap", [message(f) for f in frames])
+    found = recognised(lane, tmp_path, frames)
     assert sum("not used" in reason for _, reason in found.warnings) == 1
     assert len(found.detections) > 0.8 * len(plain.detections)
 
 
 def test_a_leap_of_the_clock_costs_one_frame(lane, tmp_path, plain):
     frames = frames_of(lane)
-    wrong = replace(frames[30], stamps_ns=frames[30].stamps_ns + 10 * SECONDS)
-    messages = [message(f) for f in frames]
-    messages[30] = message(wrong, recorded_ns=int(frames[30].stamps_ns[0]))
-    found = recognised(lane, tmp_path / "log.mcap", messages)
-    assert found.warnings == [(int(wrong.stamps_ns[0]), f"frame not used: {LEAPT}")]
+    recorded_ns = frames[30].stamps_ns
+    frames[30] = replace(frames[30], stamps_ns=recorded_ns + 10 * SECONDS)
+    found = recognised(lane, tmp_path, frames, log_times_ns=recorded_ns)
+    assert found.warnings == [(int(frames[30].stamps_ns[0]), f"frame not used: {LEAPT}")]
     assert len(found.detections) >= len(plain.detections) - 3
 
 
 def test_a_message_that_is_no_image_is_named_and_the_others_are_used(lane, tmp_path, plain):
-    messages = [message(f) for f in frames_of(lane)]
-    whole = messages[30].payloads
-    messages[30] = replace(messages[30], payloads=np.ascontiguousarray(whole[:, :-1000]))
-    found = recognised(lane, tmp_path / "log.mcap", messages)
+    whole = sonar_image_messages(TOPIC, lane.one(30)).payloads
+    found = recognised(lane, tmp_path, payloads=np.ascontiguousarray(whole[:, :-1000]))
     ((stamp, reason),) = found.warnings
     assert stamp == lane.frames.stamps_ns[30]
     assert "image.data" in reason
@@ -103,14 +93,14 @@ def test_a_message_that_is_no_image_is_named_and_the_others_are_used(lane, tmp_p
 
 def test_bad_frames_are_never_drawn(lane, tmp_path):
     frames = [replace(f, intensity=np.full(f.intensity.shape, np.nan, np.float32)) for f in frames_of(lane)[:12]]
-    found = recognised(lane, tmp_path / "log.mcap", [message(f) for f in frames])
+    found = recognised(lane, tmp_path, frames)
     assert found.pictures == []
     assert found.outcomes == {"frame not used: samples that are not finite": 12}
 
 
 def test_of_two_sonars_one_must_be_chosen_before_any_image_is_read(lane, tmp_path, plain):
     log = tmp_path / "log.mcap"
-    messages = [message(f, topic) for f in frames_of(lane) for topic in (TOPIC, "/other/image")]
+    messages = [sonar_image_messages(topic, f) for f in frames_of(lane) for topic in (TOPIC, "/other/image")]
     write_log(log, lane.sequence, messages)
     sequence, done = read_log(log), []
     with pytest.raises(LogError, match=r"2 topics fit: /other/image, /sonar/image; choose one: --topic sonar="):
@@ -122,8 +112,7 @@ def test_of_two_sonars_one_must_be_chosen_before_any_image_is_read(lane, tmp_pat
 
 
 def test_only_the_part_that_was_read_is_recognised(lane, tmp_path):
-    log = tmp_path / "log.mcap"
-    write_log(log, lane.sequence, [message(f) for f in frames_of(lane)])
+    log = write(lane, tmp_path / "log.mcap")
     window = TimeWindow(Instant.parse("2"), Instant.parse("8"))
     found = recognise_images(log, read_log(log, window=window), window=window)
     assert 28 <= found.frames <= 31
@@ -131,8 +120,7 @@ def test_only_the_part_that_was_read_is_recognised(lane, tmp_path):
 
 
 def test_a_hole_is_refused_and_with_salvage_named_and_the_rest_is_used(lane, tmp_path):
-    log = tmp_path / "log.mcap"
-    write_log(log, lane.sequence, [message(f) for f in frames_of(lane)])
+    log = write(lane, tmp_path / "log.mcap")
     data = bytearray(log.read_bytes())
     data[len(data) // 2] ^= 0xFF
     log.write_bytes(data)
@@ -145,10 +133,8 @@ def test_a_hole_is_refused_and_with_salvage_named_and_the_rest_is_used(lane, tmp
 
 
 def test_a_log_without_depth_and_floor_is_recognised_in_the_image_plane(lane, tmp_path):
-    log = tmp_path / "log.mcap"
     bare = replace(lane.sequence, depth=None, calibration=lane.sequence.calibration.model_copy(update={"floor": None}))
-    write_log(log, bare, [message(f) for f in frames_of(lane)])
-    found = recognise_images(log, read_log(log))
+    found = recognised(replace(lane, sequence=bare), tmp_path)
     assert found.frames == COUNT
     assert found.warnings == []
     assert found.outcomes[NO_FLOOR] == COUNT

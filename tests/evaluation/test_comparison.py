@@ -89,11 +89,6 @@ def test_all_are_scored_at_the_instants_that_all_have(install):
 
 
 def test_a_failed_run_is_a_row_and_does_not_disturb_the_others(install):
-    class Broken(Offset):
-        def process(self, _measurements: Measurements) -> Estimate | None:
-            raise RuntimeError("diverged")
-
-    install(broken=Broken)
     together, alone = compare(straight_sequence(), ["broken", "offset"]), compare(straight_sequence(), ["offset"])
     assert [(run.estimator, run.status) for run in together.runs] == [("broken", "failed"), ("offset", "ok")]
     assert together.scores["broken"] == {}

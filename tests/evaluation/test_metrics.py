@@ -31,10 +31,9 @@ def disturbed(truth: Trajectory, seed: int) -> Trajectory:
     return Trajectory.without_covariances(truth.stamps_ns, positions, rotations.as_quat())
 
 
-def moved(trajectory: Trajectory, turn: Rotation, shift: tuple[float, float, float]) -> Trajectory:
-    return Trajectory.without_covariances(
-        trajectory.stamps_ns, turn.apply(trajectory.positions) + shift, (turn * trajectory.rotations()).as_quat()
-    )
+def moved(path: Trajectory, turn: Rotation, shift: tuple[float, float, float]) -> Trajectory:
+    places, attitudes = turn.apply(path.positions) + shift, turn * path.rotations()
+    return Trajectory.without_covariances(path.stamps_ns, places, attitudes.as_quat())
 
 
 def as_evo(trajectory: Trajectory) -> PoseTrajectory3D:

@@ -12,7 +12,6 @@ from sonar_graph.evaluation.scored_instants import (
     IDS,
     MAP_TIMES_S,
     TRUE_XY_M,
-    gap_limit_s,
     map_instants,
     published_maps,
     repeats_published,
@@ -38,52 +37,30 @@ def seconds(*values: float) -> np.ndarray:
 DENSE = np.arange(0, 3.01, 0.1).tolist()
 
 
-def test_instants_outside_the_truth_are_left_out_and_counted():
-    scored = scored_instants(seconds(-0.5, 0, 1, 3, 3.5), trajectory(DENSE), [])
-    np.testing.assert_array_equal(scored.stamps_ns, seconds(0, 1, 3))
-    assert (scored.asked, scored.outside_truth, scored.in_truth_gap) == (5, 2, 0)
-    assert str(scored) == "3 of 5 instants (left out: 2 outside the truth's time span)"
+OCCLUDED, HIDDEN_SHORTLY = ([t for t in DENSE if not low < t < high] for low, high in ((1.0, 1.95), (1.05, 1.45)))
+SPARSE = [0.0, 1.0, 2.0, 3.0, 6.0, 7.0]
+# fmt: off
+SCORED = [
+    # asked, truth, of each run, scored, outside truth, in its gaps, not estimated, said
+    ([-0.5, 0, 1, 3, 3.5], DENSE, [], [0, 1, 3], 2, 0, 0, "3 of 5 instants (left out: 2 outside the truth's time span"),
+    ([0.5, 1.0, 1.5, 2.0], OCCLUDED, [], [0.5, 1.0, 2.0], 0, 1, 0, "1 in gaps of the truth longer than 0.5 s"),
+    ([1.25], HIDDEN_SHORTLY, [], [1.25], 0, 0, 0, "1 of 1 instants"),
+    ([0.5, 1.5, 4.0, 6.5], SPARSE, [], [0.5, 1.5, 6.5], 0, 1, 0, "1 in gaps of the truth longer than 1.5 s"),
+    ([0.5, 1.0, 1.5], DENSE, [[1.0, 1.5], [0.5, 1.0, 1.5], None], [1.0, 1.5], 0, 0, 1, "1 without an estimate"),
+    ([-0.5, 0.5, 1.5, 2.5, 3.0, 3.5], OCCLUDED, [[2.5, 3.0, 3.5]], [2.5, 3.0], 2, 1, 1, "2 of 6 instants"),
+]
+# fmt: on
 
 
-def test_instants_in_a_gap_of_the_truth_are_left_out_but_not_its_edges():
-    occluded = [t for t in DENSE if not 1.0 < t < 1.95]
-    scored = scored_instants(seconds(0.5, 1.0, 1.5, 2.0), trajectory(occluded), [])
-    np.testing.assert_array_equal(scored.stamps_ns, seconds(0.5, 1.0, 2.0))
-    assert scored.in_truth_gap == 1
-    assert "1 in gaps of the truth longer than 0.5 s" in str(scored)
-
-
-def test_a_short_gap_is_interpolated():
-    occluded = [t for t in DENSE if not 1.05 < t < 1.45]
-    assert len(scored_instants(seconds(1.25), trajectory(occluded), [])) == 1
-
-
-def test_a_sparse_truth_is_no_gap_throughout():
-    reference = trajectory([0.0, 1.0, 2.0, 3.0, 6.0, 7.0])
-    assert gap_limit_s(reference) == pytest.approx(1.5)
-    scored = scored_instants(seconds(0.5, 1.5, 4.0, 6.5), reference, [])
-    np.testing.assert_array_equal(scored.stamps_ns, seconds(0.5, 1.5, 6.5))
-
-
-def test_an_instant_that_one_run_lacks_is_left_out_for_all():
-    runs = [
-        RunResult("a", {}, "ok", causal=trajectory([0.5, 1.0, 1.5])),
-        RunResult("b", {}, "ok", causal=trajectory([1.0, 1.5])),
-        RunResult("c", {}, "failed", "raised"),
-    ]
-    scored = scored_instants(seconds(0.5, 1.0, 1.5), trajectory(DENSE), runs)
-    np.testing.assert_array_equal(scored.stamps_ns, seconds(1.0, 1.5))
-    assert scored.not_estimated == 1
-
-
-def test_every_instant_asked_for_is_scored_or_left_out_for_one_reason():
-    """The run lacks an instant before the truth, one in its gap and one that it covers: only the last is its fault."""
-    occluded = [t for t in DENSE if not 1.0 < t < 1.95]
-    runs = [RunResult("a", {}, "ok", causal=trajectory([2.5, 3.0, 3.5]))]
-    scored = scored_instants(seconds(-0.5, 0.5, 1.5, 2.5, 3.0, 3.5), trajectory(occluded), runs)
-    np.testing.assert_array_equal(scored.stamps_ns, seconds(2.5, 3.0))
-    assert (scored.outside_truth, scored.in_truth_gap, scored.not_estimated) == (2, 1, 1)
-    assert len(scored) + scored.outside_truth + scored.in_truth_gap + scored.not_estimated == scored.asked
+@pytest.mark.parametrize(("asked", "truth", "runs", "kept", "outside", "in_gap", "lacking", "said"), SCORED)
+def test_every_instant_is_scored_or_left_out_for_one_reason(asked, truth, runs, kept, outside, in_gap, lacking, said):
+    """Edges of a gap are in the truth; what lies outside the truth or in its gap is no fault of a run."""
+    results = [RunResult("a", {}, "ok", causal=trajectory(of)) if of else RunResult("a", {}, "failed") for of in runs]
+    scored = scored_instants(seconds(*asked), trajectory(truth), results)
+    np.testing.assert_array_equal(scored.stamps_ns, seconds(*kept))
+    assert (scored.outside_truth, scored.in_truth_gap, scored.not_estimated) == (outside, in_gap, lacking)
+    assert scored.asked == len(asked)
+    assert said in str(scored)
 
 
 def test_rows_are_found_by_stamp():

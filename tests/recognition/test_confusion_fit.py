@@ -11,16 +11,7 @@ from scipy.spatial.transform import Rotation
 from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS
 from sonar_graph.errors import CalibrationError
 from sonar_graph.logs.reading import read_log
-from sonar_graph.recognition.confusion_fit import (
-    NO_LABEL,
-    NONE,
-    LabelledFits,
-    LabelledSightings,
-    calibrate,
-    estimate_confusion,
-    label_of,
-    true_ranges_azimuths,
-)
+from sonar_graph.recognition import confusion_fit
 from sonar_graph.sonar.appearance import DesignFit, ObjectSighting
 from sonar_graph.sonar.bayes import virtual_evidence
 from sonar_graph.sonar.confusion import Confusion, soft_scores
@@ -40,18 +31,18 @@ def test_a_sighting_is_of_what_truly_lies_there():
         ((2.07, 0.1), 5),
         ((2.0, 0.1 + 0.07 / 2), 5),
         ((1.5, -0.2), 3),
-        ((2.09, 0.1), NO_LABEL),
-        ((2.0, 0.1 + 0.09 / 2), NO_LABEL),
-        ((2.39, 0.1), NO_LABEL),
-        ((2.41, 0.1), NONE),
-        ((2.0, 0.1 + 0.42 / 2), NONE),
+        ((2.09, 0.1), confusion_fit.NO_LABEL),
+        ((2.0, 0.1 + 0.09 / 2), confusion_fit.NO_LABEL),
+        ((2.39, 0.1), confusion_fit.NO_LABEL),
+        ((2.41, 0.1), confusion_fit.NONE),
+        ((2.0, 0.1 + 0.42 / 2), confusion_fit.NONE),
     ):
-        assert label_of(sighting(*place), IDS, RANGE_M, AZIMUTH_RAD)[0] == label, place
-        assert label_of(sighting(*place), IDS, RANGE_M, behind)[0] == NONE, place
+        assert confusion_fit.label_of(sighting(*place), IDS, RANGE_M, AZIMUTH_RAD)[0] == label, place
+        assert confusion_fit.label_of(sighting(*place), IDS, RANGE_M, behind)[0] == confusion_fit.NONE, place
 
 
 def test_sightings_become_columns_with_their_errors():
-    gathered, stranger = LabelledSightings((3, 5)), LabelledSightings((3, 9))  # no design is of landmark 5
+    gathered, stranger = map(confusion_fit.LabelledSightings, ((3, 5), (3, 9)))  # no design is of landmark 5
     fitted, other = sighting(2.01, 0.102), sighting(1.49, -0.2, is_fitted=False)
     for seen in (fitted, other, sighting(3.0, 0.1), sighting(2.2, 0.1), sighting(2.0, 0.1, is_compared=False)):
         gathered.add(seen, (0, 7), IDS, RANGE_M, AZIMUTH_RAD)
@@ -68,7 +59,7 @@ def test_sightings_become_columns_with_their_errors():
 @given(st.integers(0, 27))
 def test_true_ranges_and_azimuths_are_those_of_the_simulator(lane, second: int):
     stamp_ns = int(lane.sequence.truth.stamps_ns[50 * second])
-    range_m, azimuth_rad = true_ranges_azimuths(lane.sequence, stamp_ns)
+    range_m, azimuth_rad = confusion_fit.true_ranges_azimuths(lane.sequence, stamp_ns)
     motion = lane.path.at(np.array([float(second)]))
     mounting = lane.sequence.calibration.sonar.mounting
     body_R_sonar = Rotation.from_euler("ZYX", mounting.rpy_rad[::-1])
@@ -89,7 +80,7 @@ def few_frames_are_enough():
 
 @pytest.fixture(scope="module")
 def measured(lane_log) -> Confusion:
-    return calibrate([(lane_log, read_log(lane_log))])
+    return confusion_fit.calibrate([(lane_log, read_log(lane_log))])
 
 
 def test_a_model_measured_on_a_log_is_of_its_landmarks_and_says_where_it_comes_from(lane, measured):
@@ -108,7 +99,7 @@ def test_a_model_measured_on_a_log_is_of_its_landmarks_and_says_where_it_comes_f
 
 def test_logs_count_together(lane_log, measured):
     run = read_log(lane_log)
-    twice = calibrate([(lane_log, run), (lane_log, replace(run, notes={}))])
+    twice = confusion_fit.calibrate([(lane_log, run), (lane_log, replace(run, notes={}))])
     said, once = twice.provenance, measured.provenance
     assert (said["logs"], said["what they are"]) == ("lane.mcap, lane.mcap", "a lane; recorded")
     for name in ("frames of landmark 1", "tracks of landmark 1"):
@@ -121,7 +112,7 @@ def test_frames_that_come_too_late_count_nothing_again(lane, measured, tmp_path)
     rows = [row for k in range(len(lane.frames)) for row in ([k, k - 3] if k % 5 == 4 else [k])]
     late = lane.write(tmp_path / "lane.mcap", [lane.one(row) for row in rows])
     assert len(rows) > len(lane.frames) + 20
-    assert calibrate([(late, read_log(late))]) == measured
+    assert confusion_fit.calibrate([(late, read_log(late))]) == measured
 
 
 STRANGERS = tuple(replace(d, id=d.id + 6) for d in DEFAULT_DESIGNS[:2])
@@ -144,22 +135,22 @@ def test_logs_in_which_landmarks_cannot_be_labelled_are_refused_by_name(lane_log
         stamps_ns = run.truth.stamps_ns
         changes = {"truth": run.truth.rows(stamps_ns >= stamps_ns[len(stamps_ns) // 3])}
     with pytest.raises(CalibrationError, match=words):
-        calibrate([(lane_log, replace(run, **changes))], designs=designs)
+        confusion_fit.calibrate([(lane_log, replace(run, **changes))], designs=designs)
 
 
-def _fits(per_class: int, noise: float, seed: int = 0) -> LabelledFits:
+def _fits(per_class: int, noise: float, seed: int = 0) -> confusion_fit.LabelledFits:
     """Correlations of 0.9 with the true design and 0.7 with others; of 0.6 with all where there is none."""
     rng = np.random.default_rng(seed)
     label = np.repeat(np.arange(3), per_class)
     means = np.array([[0.9, 0.7], [0.7, 0.9], [0.6, 0.6]])[label]
     error = np.where((label < 2)[:, None], rng.normal(0, [0.01, 0.002], (len(label), 2)), np.nan)
-    return LabelledFits(
+    return confusion_fit.LabelledFits(
         means + rng.normal(0, noise, means.shape), np.ones(len(label)), label, np.arange(len(label)), error
     )
 
 
 def test_scores_that_are_fitted_are_calibrated():
-    fitted, unseen = estimate_confusion(_fits(400, 0.08), (1, 2), {}), _fits(400, 0.08, seed=1)
+    fitted, unseen = confusion_fit.estimate_confusion(_fits(400, 0.08), (1, 2), {}), _fits(400, 0.08, seed=1)
     scores = soft_scores(unseen.correlation, unseen.visible, fitted.sharpness, fitted.threshold)
     confidence, right = scores.max(axis=1), scores.argmax(axis=1) == unseen.label
     assert abs(confidence.mean() - right.mean()) < 0.04
@@ -168,7 +159,7 @@ def test_scores_that_are_fitted_are_calibrated():
 
 def test_matrix_is_the_mean_score_of_each_class():
     fits = _fits(100, 0.1)
-    model = estimate_confusion(fits, (1, 2), {"origin": "made up"})
+    model = confusion_fit.estimate_confusion(fits, (1, 2), {"origin": "made up"})
     scores = soft_scores(fits.correlation, fits.visible, model.sharpness, model.threshold)
     for k in range(3):
         np.testing.assert_allclose(np.array(model.matrix)[k], scores[fits.label == k].mean(axis=0), atol=5e-3)
@@ -183,7 +174,8 @@ def test_frames_that_never_were_confused_are_as_sure_as_their_tracks_allow_withi
     """With n tracks of a class (n + 1) / (n + 2) is certainty. The loss is the entropy of that, half a nat
     over all tracks, and a little for what two numbers cannot fit."""
     fits = _fits(200, 0.01)
-    model = estimate_confusion(replace(fits, track=np.arange(600) % tracks + 1000 * fits.label), (1, 2), {})
+    fits = replace(fits, track=np.arange(600) % tracks + 1000 * fits.label)
+    model = confusion_fit.estimate_confusion(fits, (1, 2), {})
     scores = soft_scores(fits.correlation, fits.visible, model.sharpness, model.threshold)
     posterior = virtual_evidence(np.full((600, 3), 1 / 3), scores, model.array(), model.base(), np.ones(600))
     n = np.array([2 * tracks, 2 * tracks, tracks])[fits.label]
@@ -197,13 +189,13 @@ def test_frames_that_never_were_confused_are_as_sure_as_their_tracks_allow_withi
     assert model.sharpness < 100
 
 
-def some(fits: LabelledFits, rows: np.ndarray) -> LabelledFits:
-    return LabelledFits(*(column[rows] for column in vars(fits).values()))
+def some(fits: confusion_fit.LabelledFits, rows: np.ndarray) -> confusion_fit.LabelledFits:
+    return confusion_fit.LabelledFits(*(column[rows] for column in vars(fits).values()))
 
 
 def test_a_class_with_too_few_frames_is_named():
     with pytest.raises(CalibrationError, match="no landmark: 5"):
-        estimate_confusion(some(_fits(100, 0.1), np.arange(205)), (1, 2), {})
+        confusion_fit.estimate_confusion(some(_fits(100, 0.1), np.arange(205)), (1, 2), {})
 
 
 def test_sigmas_are_root_mean_squares_of_a_landmark_that_is_wholly_in_view():
@@ -211,7 +203,7 @@ def test_sigmas_are_root_mean_squares_of_a_landmark_that_is_wholly_in_view():
     fits = _fits(300, 0.1)
     off = replace(fits, range_azimuth_error=fits.range_azimuth_error + np.array([0.03, -0.005]))
     cut = replace(fits, visible=np.full(900, 0.7), range_azimuth_error=fits.range_azimuth_error / 0.7**2)
-    model, partly = (estimate_confusion(f, (1, 2), {}) for f in (off, cut))
+    model, partly = (confusion_fit.estimate_confusion(f, (1, 2), {}) for f in (off, cut))
     sigmas = np.hypot([0.03, 0.005], [0.01, 0.002])
     assert [model.range_sigma_m, model.azimuth_sigma_rad] == pytest.approx(sigmas, rel=0.05)
     assert partly.range_sigma_m == pytest.approx(0.01, rel=0.15)
@@ -223,7 +215,7 @@ def test_a_class_that_was_seen_more_often_counts_no_more():
     """Every frame of the first class five times over, on the same tracks."""
     fits = _fits(60, 0.1)
     more = some(fits, np.concatenate([np.repeat(np.arange(60), 5), np.arange(60, 180)]))
-    one, other = (estimate_confusion(f, (1, 2), {}) for f in (fits, more))
+    one, other = (confusion_fit.estimate_confusion(f, (1, 2), {}) for f in (fits, more))
     assert other.sharpness == pytest.approx(one.sharpness, rel=0.01)
     assert other.threshold == pytest.approx(one.threshold, abs=0.002)
     np.testing.assert_allclose(other.matrix, one.matrix, atol=2e-3)

@@ -37,7 +37,6 @@ def test_the_surest_picture_of_each_landmark_is_shown_in_order(recognition: Reco
 def test_what_was_written_is_read_again_and_the_commonest_outcome_comes_first(recognition, tmp_path: Path) -> None:
     write_recognition(recognition, tmp_path)
     read = read_recognition(tmp_path)
-    assert read is not None
     assert (read.frames, read.outcomes, read.notes) == (7, recognition.outcomes, recognition.notes)
     assert list(read.outcomes) == ["reported", "not reported: rare"]
     assert read.warnings == recognition.warnings

@@ -1,10 +1,7 @@
 """From a log with images to detections that are right: the whole chain, on a lane whose truth is known."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -21,10 +18,7 @@ from sonar_graph.simulation.sonar_image.imaging_sonar import DIDSON
 from sonar_graph.sonar.bayes import IdentityParams
 from sonar_graph.sonar.confusion import confusion_for
 from sonar_graph.sonar.recogniser import REPORTED, RecogniserParams
-from tests.recognition.imaged_lane import TOPIC
-
-if TYPE_CHECKING:
-    from tests.recognition.imaged_lane import Lane
+from tests.recognition.imaged_lane import TOPIC, Lane
 
 SURE = 0.9
 

@@ -109,9 +109,7 @@ def test_differences_are_paired_and_their_tests_corrected_within_a_metric():
     assert single < corrected <= 12 * single + 1e-12
     assert {log for _, log, _ in tests} == {*LOGS, ALL_LOGS}
     alone = tables.all_tests(BATCH, [Metric("ate_se2_m", {"Causal": KEY})])
-    doubled = tables.all_tests(
-        BATCH, [Metric("ate_se2_m", {"Causal": KEY, "Smoothed": KEY})]
-    )  # as of a filter: one test
+    doubled = tables.all_tests(BATCH, [Metric("ate_se2_m", {"Causal": KEY, "Smoothed": KEY})])  # as of a filter
     assert {place: p for place, (_, p) in doubled.items()} == {place: p for place, (_, p) in alone.items()}
 
 
@@ -146,10 +144,9 @@ def test_a_p_value_shows_its_side_of_five_percent():
 
 def test_consistency_is_judged_over_runs_by_the_chi_square_band():
     batch = drawn_batch(40)
-    verdicts = {
-        (row["log"], row["contestant"], row["of"]): row["causal_verdict"]
-        for row in rows_of(tables.consistency_table(batch))
-    }
+    verdicts = {}
+    for row in rows_of(tables.consistency_table(batch)):
+        verdicts[row["log"], row["contestant"], row["of"]] = row["causal_verdict"]
     assert verdicts[LOGS[0], "ekf-slam", "position"] == "over-confident"
     assert verdicts[LOGS[0], "isam2", "position"] == "consistent"
     row = row_of(tables.consistency_table(with_failures(batch, "isam2", LOGS[0], 1)), "isam2")
@@ -189,11 +186,8 @@ def test_every_run_is_listed_once_and_leads_to_its_log():
     lists = tables.run_lists(batch, metrics_of(METRICS))
     links = [cell.link for _, table in lists for line in table.rows for cell in line if cell.link]
     assert sorted(links) == sorted(run.log_file for run in batch.runs)
-    anchors = {table.name for _, table in lists}
-    targets = {
-        cell.link.removeprefix("#") for line in tables.accuracy_table(batch, ATE).rows for cell in line if cell.link
-    }
-    assert targets == anchors
+    cells = itertools.chain(*tables.accuracy_table(batch, ATE).rows)
+    assert {cell.link for cell in cells if cell.link} == {f"#{table.name}" for _, table in lists}
 
 
 def test_latex_has_as_many_cells_as_columns_in_every_row_and_takes_no_commands_from_names(tmp_path):
@@ -270,9 +264,8 @@ def test_too_few_seeds_are_warned_of_and_cost_others_nothing():
     assert "4 pairs" in summary.power_told(tables.all_tests(few, EVERY_METRIC))[0]
     assert summary.power_told(tables.all_tests(many, EVERY_METRIC)) == []
     assert f"{ALL_LOGS} (4 seeds)" in summary.power_told(tables.all_tests(drawn_batch(4), EVERY_METRIC))[0]
-    tests = {
-        (KEY, f"{pairs} of them", "isam2"): (paired(np.arange(pairs) + 1.0, np.zeros(pairs)), 1.0) for pairs in (5, 6)
-    }
+    differences = {pairs: paired(np.arange(pairs) + 1.0, np.zeros(pairs)) for pairs in (5, 6)}
+    tests = {(KEY, f"{pairs} of them", "isam2"): (one, 1.0) for pairs, one in differences.items()}
     told = "Too few pairs for any corrected p value to fall below 0.05: 5 of them (5 pairs). Add seeds."
     assert summary.power_told(tests) == [told]
     batch = drawn_batch(7, logs=LOGS[:1])
@@ -304,7 +297,7 @@ def test_time_and_memory_are_shown_and_not_tested(key):
     assert summary.head_metric(batch, [metric]) is None
 
 
-def test_a_reference_that_never_ended_is_warned_of():
+def test_a_reference_that_never_ended_and_runs_that_were_scored_at_other_instants_are_warned_of():
     batch = drawn_batch(8)
     assert summary.reference_told(with_failures(batch, "dead-reckoning", LOGS[0], 7)) == []
     lost = with_failures(batch, "dead-reckoning", LOGS[0], 8)
@@ -313,9 +306,6 @@ def test_a_reference_that_never_ended_is_warned_of():
     ]
     (told,) = tables.difference_table(lost, ATE, compared_runs(lost)).rows[:1]
     assert told[4].text == "better: reference has no value"
-
-
-def test_runs_that_were_scored_at_other_instants_are_warned_of():
     even = updated(drawn_batch(2), lambda _: {"scored_instants": 50.0})
     fewer = replace(even.runs[0], values=even.runs[0].values | {"scored_instants": 40.0})
     assert summary.instants_told(even) == []
@@ -331,16 +321,16 @@ def test_arrows_point_to_the_side_of_the_difference_and_only_where_it_is_no_chan
     assert summary.LOWER not in cell_of(table, LOGS[0], "Causal", "ekf-slam").text
     few = overview_of(replace(batch, runs=[run for run in batch.runs if run.seed in (0, 1, 2)]))
     assert not any(arrow in cell.text for row in few.rows for cell in row for arrow in (summary.LOWER, summary.HIGHER))
+    batch = with_failures(drawn_batch(logs=LOGS[:1]), "isam2", LOGS[0], 10)
+    assert cell_of(overview_of(batch), LOGS[0], "Causal", "isam2").text == f"no value {summary.HIGHER}"
+    assert "higher with isam2" in heads_of(batch)[0], "who never ended is not left out"
 
 
 @pytest.mark.parametrize(
     ("median", "mark"),
     [
-        (-0.1, summary.LOWER),
-        (0.1, summary.HIGHER),
-        (-math.inf, summary.LOWER),
-        (math.inf, summary.HIGHER),
-        (0.0, summary.DIFFERENT),
+        *((-0.1, summary.LOWER), (0.1, summary.HIGHER), (0.0, summary.DIFFERENT)),
+        *((-math.inf, summary.LOWER), (math.inf, summary.HIGHER)),
     ],
 )
 def test_the_mark_is_of_the_median_and_only_below_five_percent(median, mark):
@@ -362,15 +352,9 @@ def test_a_median_keeps_its_digits_beside_a_run_that_lost_its_way():
     batch = changed(drawn_batch(logs=LOGS[:1]), "isam2", "causal.ate_se2_m", np.append(np.ones(9), 1e5))
     shown = float(cell_of(overview_of(batch), LOGS[0], "Causal", "isam2").text.split()[0])
     assert shown == pytest.approx(np.median(batch.values(LOGS[0], "isam2", "causal.ate_se2_m")), rel=0.1)
-    row = next(row for row in tables.accuracy_table(batch, ATE).rows if row[1].text == "isam2")
+    row = cells_of(tables.accuracy_table(batch, ATE), "isam2")
     assert float(row[4].text) == shown
     assert 0 < float(row[5].text.partition(" to ")[0]) <= shown
-
-
-def test_who_never_ended_is_higher_than_the_reference_and_not_left_out():
-    batch = with_failures(drawn_batch(logs=LOGS[:1]), "isam2", LOGS[0], 10)
-    assert cell_of(overview_of(batch), LOGS[0], "Causal", "isam2").text == f"no value {summary.HIGHER}"
-    assert "higher with isam2" in heads_of(batch)[0]
 
 
 def test_the_sentence_counts_logs_where_somebody_is_told_apart():

@@ -49,7 +49,6 @@ def test_every_run_score_protocol_and_file_appears(comparison, page):
 
 def test_every_reason_of_refusal_is_counted(comparison, page):
     log = comparison.runs[0].detections
-    assert log is not None
     for outcome in [Outcome.USED, Outcome.NEW, *REFUSALS]:
         assert re.search(rf"{re.escape(outcome.value.capitalize())} {log.outcomes.count(outcome)} \(", page.text)
     assert f"All detections {len(log)}" in page.text
@@ -80,6 +79,9 @@ def test_a_failed_run_is_named_first_with_its_reason_escaped(comparison):
     }
 
 
+UNMEASURED, ENDLESS = Score(float("nan"), "MB", "Not measured."), Score(float("inf"), "m", "Diverged.")
+
+
 @pytest.mark.parametrize(
     "change",
     [
@@ -87,10 +89,7 @@ def test_a_failed_run_is_named_first_with_its_reason_escaped(comparison):
         lambda c: with_failure(only(c, "isam2"), "isam2", "no odometry"),
         lambda c: with_run(c, replace(c.runs[0], update_s=np.empty(0), detections=None, landmarks=None)),
         lambda c: with_score(
-            with_score(c, "isam2", "memory.peak_mb", Score(float("nan"), "MB", "Not measured.")),
-            "isam2",
-            "causal.ate_se2_m",
-            Score(float("inf"), "m", "Diverged."),
+            with_score(c, "isam2", "memory.peak_mb", UNMEASURED), "isam2", "causal.ate_se2_m", ENDLESS
         ),
         lambda c: replace(c, scores={run.estimator: {} for run in c.runs}, errors={}),
     ],
@@ -151,7 +150,6 @@ def recognised(lane, lane_recognition) -> Comparison:
 
 def test_the_section_shows_pictures_counts_and_reliability(recognised, lane_recognition):
     content = recognition_content(recognised)
-    assert content is not None
     assert content["frames"] == lane_recognition.frames
     assert texts(content["outcomes"]) == {outcome: [str(n)] for outcome, n in lane_recognition.outcomes.items()}
     assert len(content["pictures"]) == len(lane_recognition.shown()) == 4
@@ -163,11 +161,9 @@ def test_the_section_shows_pictures_counts_and_reliability(recognised, lane_reco
     for landmark, probability in zip(shown.landmark_ids, shown.probabilities, strict=True):
         assert f"ID {landmark} ({probability:.2f})" in first["caption"]
     judged = reliability_of(recognised.sequence)
-    assert judged is not None
     assert content["expected_error"] == f"{judged.expected_error:.3f}"
     assert "<svg" in content["reliability"]
     blind = recognition_content(replace(recognised, sequence=replace(recognised.sequence, truth=None)))
-    assert blind is not None
     assert (blind["expected_error"], blind["reliability"]) == (None, "")
     assert recognition_content(basin_comparison()) is None, "a comparison without images"
 
@@ -176,7 +172,6 @@ def test_the_report_holds_pictures_and_warnings_with_their_time(recognised):
     warnings = [(recognised.sequence.start_ns + 1_250_000_000, "<b> & so on")]
     warned = replace(recognised, recognition=replace(recognised.recognition, warnings=warnings))
     content = recognition_content(warned)
-    assert content is not None
     assert texts(content["warnings"]) == {"1.25": ["<b> & so on"]}
     page = render_report(warned).split('id="recognition"')[1].split("</section>")[0]
     assert all(shown in page for shown in ("1.25", "&lt;b&gt; &amp; so on", content["expected_error"]))
@@ -199,7 +194,6 @@ def test_the_figure_shows_shares_over_confidence_and_counts():
 def test_detections_are_counted_by_what_they_truly_are(recognised, lane_recognition):
     """Right, wrong and taken for no landmark: in all as many as there are detections."""
     content = recognition_content(recognised)
-    assert content is not None
     assert content["detections"] == len(lane_recognition.detections)
     named = texts(content["named"])
     assert list(named)[:5] == [*(f"landmark {k}" for k in (1, 2, 3, 4)), "no landmark"]
@@ -216,8 +210,6 @@ def test_a_landmark_that_is_named_as_another_is_named_wrongly(recognised):
     swapped = replace(detections, candidate_ids=detections.candidate_ids % 4 + 1)
     before = recognition_content(recognised)
     after = recognition_content(replace(recognised, sequence=replace(recognised.sequence, detections=swapped)))
-    assert before is not None
-    assert after is not None
     for what in (f"landmark {k}" for k in (1, 2, 3, 4)):
         right, wrong, none = texts(before["named"])[what]
         assert texts(after["named"])[what] == [wrong, right, none]

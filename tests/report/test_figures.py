@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.colors import to_hex
-from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from scipy.stats import chi2
 
@@ -35,14 +34,9 @@ FIGURES = {
 """Every figure, with the labels of its axes."""
 
 
-def drawn(figure: Figure | None) -> Figure:
-    assert figure is not None
-    return figure
-
-
 @pytest.mark.parametrize("draw", FIGURES)
 def test_a_figure_is_a_well_formed_svg_with_quantities_and_units_in_the_colours_of_the_page(comparison, draw):
-    figure, (x, y) = drawn(draw(comparison)), FIGURES[draw]
+    figure, (x, y) = draw(comparison), FIGURES[draw]
     assert {panel.get_xlabel() for panel in figure.axes} - {""} == {x}
     assert {panel.get_ylabel() for panel in figure.axes} - {""} == y
     svg = inline_svg(figure, "figure", 'says "<x>" & more')
@@ -56,14 +50,14 @@ def test_a_figure_is_a_well_formed_svg_with_quantities_and_units_in_the_colours_
 
 
 def test_height_is_drawn_of_three_dimensional_runs_and_no_error_without_truth():
-    figure = drawn(figures.error_figure(basin_comparison(60, planar=False)))
+    figure = figures.error_figure(basin_comparison(60, planar=False))
     assert "error in z (m)" in {panel.get_ylabel() for panel in figure.axes}
     comparison = basin_comparison(60, truth=False)
     assert [draw for draw in FIGURES if draw(comparison) is None] == [figures.error_figure, figures.nees_figure]
 
 
 def test_two_inline_svgs_share_no_identifier(comparison):
-    both = [drawn(figures.yaw_figure(comparison)), drawn(figures.timing_figure(comparison))]
+    both = [figures.yaw_figure(comparison), figures.timing_figure(comparison)]
     first, second = (inline_svg(figure, name, "") for figure, name in zip(both, ("a", "b"), strict=True))
     own = [set(re.findall(r'\sid="([^"]+)"', svg)) for svg in (first, second)]
     assert own[0]
@@ -72,7 +66,7 @@ def test_two_inline_svgs_share_no_identifier(comparison):
 
 
 def test_map_has_one_scale_landmark_ids_smoothed_paths_that_differ_and_keeps_its_view(comparison):
-    panel = drawn(map_figure(comparison)).axes[0]
+    panel = map_figure(comparison).axes[0]
     assert panel.get_aspect() == 1
     assert {text.get_text() for text in panel.texts} == {"1", "2", "3", "4"}
     shown = panel.get_legend_handles_labels()[1]
@@ -81,7 +75,7 @@ def test_map_has_one_scale_landmark_ids_smoothed_paths_that_differ_and_keeps_its
     *_, run = comparison.runs
     away = replace(run.causal, positions=run.causal.positions + np.array([500.0, 0, 0]))
     gone = with_run(comparison, replace(run, causal=away, smoothed=None))
-    assert np.ptp(drawn(map_figure(gone)).axes[0].get_xlim()) < 20
+    assert np.ptp(map_figure(gone).axes[0].get_xlim()) < 20
     assert paths_cut_off(gone) == ["dead-reckoning"]
     assert paths_cut_off(only(comparison, "isam2")) == []
 
@@ -93,7 +87,7 @@ def comparison() -> Comparison:
 
 def test_errors_and_their_band_are_drawn_in_their_units(comparison):
     name = "ekf-slam"
-    figure = drawn(figures.error_figure(only(comparison, name)))
+    figure = figures.error_figure(only(comparison, name))
     errors = comparison.errors[name]["causal"]
     x_line, yaw_line = figure.axes[0].lines[-1], figure.axes[2].lines[-1]
     np.testing.assert_allclose(x_line.get_ydata(), errors.position_m[:, 0])
@@ -106,18 +100,14 @@ def test_errors_and_their_band_are_drawn_in_their_units(comparison):
 
 def test_no_band_is_drawn_where_no_covariance_was_reported(comparison):
     errors = comparison.errors["isam2"]["causal"]
-    unknown = replace(
-        errors,
-        position_sigma_m=np.full_like(errors.position_sigma_m, np.nan),
-        yaw_sigma_rad=np.full_like(errors.yaw_sigma_rad, np.nan),
-    )
-    silent = replace(only(comparison, "isam2"), errors={"isam2": {"causal": unknown}})
-    assert not any(panel.collections for panel in drawn(figures.error_figure(silent)).axes)
-    assert any(panel.collections for panel in drawn(figures.error_figure(comparison)).axes)
+    unknown = {name: np.nan * getattr(errors, name) for name in ("position_sigma_m", "yaw_sigma_rad")}
+    silent = replace(only(comparison, "isam2"), errors={"isam2": {"causal": replace(errors, **unknown)}})
+    assert not any(panel.collections for panel in figures.error_figure(silent).axes)
+    assert any(panel.collections for panel in figures.error_figure(comparison).axes)
 
 
 def test_yaw_is_never_joined_across_the_wrap(comparison):
-    for line in drawn(figures.yaw_figure(comparison)).axes[0].lines:
+    for line in figures.yaw_figure(comparison).axes[0].lines:
         steps = np.abs(np.diff(np.asarray(line.get_ydata(), dtype=float)))
         assert np.nanmax(steps) <= 180
         assert np.isnan(steps).any(), "three laps pass ±180° and must leave gaps"
@@ -125,8 +115,7 @@ def test_yaw_is_never_joined_across_the_wrap(comparison):
 
 def test_landmark_ellipses_hold_95_percent_of_draws(comparison):
     run = comparison.runs[0]
-    assert run.landmarks is not None
-    panel = drawn(map_figure(only(comparison, "isam2"))).axes[0]
+    panel = map_figure(only(comparison, "isam2")).axes[0]
     ellipses = [patch for patch in panel.patches if isinstance(patch, Ellipse)]
     assert len(ellipses) == len(run.landmarks)
     rng = np.random.default_rng(3)
@@ -141,13 +130,13 @@ def test_landmark_ellipses_hold_95_percent_of_draws(comparison):
 @pytest.mark.parametrize("draw", [map_figure, figures.yaw_figure, figures.timing_figure])
 def test_estimators_keep_their_colour_when_another_one_fails(comparison, draw):
     failed = with_failure(comparison, "isam2", "lost")
-    used = {to_hex(line.get_color()) for panel in drawn(draw(failed)).axes for line in panel.lines}
+    used = {to_hex(line.get_color()) for panel in draw(failed).axes for line in panel.lines}
     assert colour(0) not in used
     assert {colour(1), colour(2)} <= used
 
 
 def test_every_nees_stays_in_view(comparison):
-    figure = drawn(figures.nees_figure(comparison))
+    figure = figures.nees_figure(comparison)
     for panel, run in zip(figure.axes, comparison.runs, strict=False):
         errors = comparison.errors[run.estimator]["causal"]
         assert panel.get_ylim()[1] > np.nanmax(errors.nees_position) / errors.position_dof
@@ -197,13 +186,11 @@ def grown(instants: int = 240, sigma_m: float = 0.05) -> Comparison:
 def test_each_panel_shows_what_was_known_then():
     comparison = grown()
     figure = growth_figure(comparison)
-    assert figure is not None
     panels = np.array(figure.axes).reshape(2, 3)
     stamps = sorted({known.stamp_ns for run in comparison.runs for known in run.maps})
     for row, run in enumerate(comparison.runs[:2]):
         for column, (panel, stamp_ns) in enumerate(zip(panels[row], stamps, strict=True)):
             lines = {line.get_label(): line for line in panel.get_lines()}
-            assert run.causal is not None
             until = run.causal.positions[run.causal.stamps_ns <= stamp_ns]
             path = np.column_stack(lines["causal estimate"].get_data())
             np.testing.assert_allclose(path, until[:, :2])
@@ -214,7 +201,6 @@ def test_each_panel_shows_what_was_known_then():
 def test_ellipses_are_as_large_as_the_caption_says():
     comparison = grown(sigma_m=0.02)
     figure, factor = growth_figure(comparison), enlargement(comparison)
-    assert figure is not None
     assert factor > 1
     ellipse = next(patch for patch in figure.axes[0].patches if isinstance(patch, Ellipse))
     assert ellipse.width == pytest.approx(2 * factor * 0.02 * np.sqrt(chi2.ppf(0.95, 2)))
@@ -235,7 +221,6 @@ def test_without_maps_on_the_way_the_page_says_so_and_a_failed_run_has_no_row():
     assert growth_figure(comparison) is None
     assert illustrations(comparison)["growth"].instead
     figure = growth_figure(with_failure(grown(60), "ekf-slam", "gave up"))
-    assert figure is not None
     assert len(figure.axes) == 3
 
 

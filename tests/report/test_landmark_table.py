@@ -17,7 +17,6 @@ UNKNOWN = np.full((3, 3), np.nan)
 def rows_of(comparison: Comparison) -> list[list[str]]:
     """The texts of the table, with hyphens for minus signs and dashes."""
     table = landmark_table(comparison)
-    assert table is not None
     return [[cell.text.replace(MINUS, "-").replace(ABSENT, "-") for cell in row] for row in table.rows]
 
 
@@ -68,7 +67,6 @@ def test_estimates_stand_beside_the_truth_with_their_difference(estimated, true,
 def test_totals_are_the_scores_and_landmarks_beyond_what_a_page_holds_are_counted():
     comparison = basin_comparison(60)
     table = landmark_table(comparison)
-    assert table is not None
     assert [column.heading for column in table.columns[2:]] == ["isam2", "ekf-slam"]
     (first,) = table.sections
     for row, key in zip(table.rows[first:], ("landmarks.raw_m", "landmarks.se2_m"), strict=True):
@@ -84,9 +82,7 @@ def test_totals_are_the_scores_and_landmarks_beyond_what_a_page_holds_are_counte
 
 def test_only_the_repeated_experiment_has_the_papers_column():
     other, same = landmark_table(basin_comparison(60)), landmark_table(repeated())
-    assert other is not None
     assert PAPER not in [column.heading for column in other.columns]
-    assert same is not None
     assert [column.heading for column in same.columns[2:]] == ["isam2", "ekf-slam", "dead-reckoning", PAPER]
     rows = rows_of(repeated())
     assert [row[-1] for row in rows[:4]] == ["4.81 (-0.19)", "-0.07 (-0.07)", "6.74 (-0.26)", "-5.01 (-0.01)"]
@@ -99,7 +95,6 @@ def test_the_return_is_told_against_the_truth_at_the_runs_own_ends(begins_later)
     """A path that keeps a distance from the truth returns as the truth does; one that drifts by 0.3 m does not."""
     comparison = repeated()
     truth = comparison.sequence.truth
-    assert truth is not None
     path = truth.rows(slice(begins_later, None))
     for drift_m, difference in ((0.0, "(0.000)"), (0.3, "(0.300)")):
         away = path.positions + np.linspace([0.5, 0.5, 0.0], [0.5 + drift_m, 0.5 + drift_m, 0.0], len(path))

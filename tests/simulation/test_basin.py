@@ -64,14 +64,11 @@ def test_shorter_runs_work_too(duration_s: float, laps: int):
     assert np.linalg.norm(run.truth.positions[-1] - run.truth.positions[0]) < 0.6
 
 
-def test_speed_is_the_one_asked_for_where_time_allows_and_never_above_the_limit():
+def test_speed_is_the_one_asked_for_where_time_allows_and_too_short_a_run_says_how_long_it_must_be():
     assert cruise_speed(BasinOptions()) == 0.15
     assert cruise_speed(BasinOptions(duration_s=300, laps=1)) == 0.15
     # 28 m in what 4 turns (8 s) and 8 ramps (3 s) leave of 120 s.
     assert cruise_speed(BasinOptions(duration_s=120, laps=1)) == pytest.approx(28 / (120 - 4 * 8 - 8 * 3))
-
-
-def test_too_short_a_run_says_how_long_it_must_be():
     with pytest.raises(SimulationError, match=r"duration_s = 100 is too short for laps = 1; give at least 119 s"):
         simulate_basin(BasinOptions(duration_s=100, laps=1))
     simulate_basin(BasinOptions(duration_s=119, laps=1))

@@ -10,18 +10,8 @@ from scipy import stats
 from sonar_graph.calibration import Mounting, SonarCalibration
 from sonar_graph.errors import SimulationError
 from sonar_graph.measurements import Floats, LandmarkDetections
+from sonar_graph.simulation import detections as simulated
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
-from sonar_graph.simulation.detections import (
-    FieldOfView,
-    SimulatedRecogniser,
-    Watched,
-    World,
-    inside,
-    landmarks_in_sonar,
-    range_azimuth_elevation,
-    simulate_detections,
-    world_on_floor,
-)
 from sonar_graph.simulation.sensors import regular_stamps, seconds_since_start
 from sonar_graph.simulation.vehicle import VehiclePath, smooth_noise
 
@@ -30,16 +20,16 @@ SONAR = SonarCalibration(
     range_sigma_m=0.015,
     azimuth_sigma_rad=0.007,
 )
-FAN = FieldOfView(1.0, 6.0, 0.6, 0.3)
-WORLD = World(np.array([3, 7, 8]), np.array([[3.0, 0.5, -2.0], [4.0, -1.0, -2.1], [2.5, 0.0, -1.5]]), -2.0)
+FAN = simulated.FieldOfView(1.0, 6.0, 0.6, 0.3)
+WORLD = simulated.World(np.array([3, 7, 8]), np.array([[3.0, 0.5, -2.0], [4.0, -1.0, -2.1], [2.5, 0.0, -1.5]]), -2.0)
 STAMPS = regular_stamps(10.0, 600.0, 0.013)
 KNOTS_S, SWAY = np.linspace(0, 600, 1201), np.array([0.8, 0.8, 0.2, 0.1, 0.1, 0.5])
 PATH = VehiclePath.through(KNOTS_S, smooth_noise(KNOTS_S, SWAY, 6.0, 6, np.random.default_rng(11)))
 
 
-def detect(sonar: SonarCalibration = SONAR, world: World = WORLD, **rates: float) -> LandmarkDetections:
-    recogniser = SimulatedRecogniser(**rates)
-    return simulate_detections(PATH, STAMPS, sonar, FAN, recogniser, world, np.random.default_rng(12))
+def detect(sonar: SonarCalibration = SONAR, world: simulated.World = WORLD, **rates: float) -> LandmarkDetections:
+    recogniser = simulated.SimulatedRecogniser(**rates)
+    return simulated.simulate_detections(PATH, STAMPS, sonar, FAN, recogniser, world, np.random.default_rng(12))
 
 
 def seen_points(frames: int | None = None) -> Floats:
@@ -64,7 +54,8 @@ def assert_binomial(successes: int, trials: int, probability: float) -> None:
 
 
 def test_points_in_the_sonars_frame_agree_with_gtsam():
-    np.testing.assert_allclose(landmarks_in_sonar(PATH, STAMPS[:20], SONAR, WORLD), seen_points(20), atol=1e-12)
+    found = simulated.landmarks_in_sonar(PATH, STAMPS[:20], SONAR, WORLD)
+    np.testing.assert_allclose(found, seen_points(20), atol=1e-12)
 
 
 def point(distance: float, azimuth: float, elevation: float) -> Floats:
@@ -74,22 +65,25 @@ def point(distance: float, azimuth: float, elevation: float) -> Floats:
 
 @given(st.floats(0.2, 20), st.floats(-3.1, 3.1), st.floats(-1.5, 1.5))
 def test_polar_coordinates_invert_their_definition(distance: float, azimuth: float, elevation: float):
-    found = range_azimuth_elevation(point(distance, azimuth, elevation))
+    found = simulated.range_azimuth_elevation(point(distance, azimuth, elevation))
     np.testing.assert_allclose(found, [distance, azimuth, elevation], rtol=1e-9, atol=1e-9)
 
 
 def test_fan_ends_at_its_edges():
     within = [(3.0, 0.0, 0.0), (1.01, 0.59, 0.29), (5.99, -0.59, -0.29)]
     outside = [(0.99, 0, 0), (6.01, 0, 0), (3, 0.61, 0), (3, -0.61, 0), (3, 0, 0.31), (3, 0, -0.31), (3, np.pi, 0)]
-    assert [bool(inside(FAN, point(*place))) for place in within + outside] == [True] * 3 + [False] * 7
+    assert [bool(simulated.inside(FAN, point(*place))) for place in within + outside] == [True] * 3 + [False] * 7
 
 
 def test_a_perfect_recogniser_reports_exactly_what_is_in_view_and_another_misses_its_share():
+    """Confidently, with room for none; where nothing is in view there is no block."""
     found, (rows, columns) = detect(), np.nonzero(in_view())
     reported = zip(found.stamps_ns.tolist(), found.most_probable()[0].tolist(), strict=True)
     assert set(reported) == set(zip(STAMPS[rows].tolist(), WORLD.landmark_ids[columns].tolist(), strict=True))
     assert 0.1 < len(rows) / (3 * len(STAMPS)) < 0.9
     assert_binomial(len(detect(detection_probability=0.7)), len(rows), 0.7)
+    np.testing.assert_allclose(np.sort(found.id_probability, axis=1), np.tile([0.01, 0.01, 0.97], (len(found), 1)))
+    assert detect(world=simulated.World(np.array([1]), np.array([[500.0, 0.0, 0.0]]), 0.0)) is None
 
 
 def test_range_and_azimuth_carry_the_noise_of_their_covariance():
@@ -108,13 +102,8 @@ def test_identities_are_mistaken_at_the_stated_rate_and_for_all_others_alike():
     assert_binomial(int(mistaken.sum()), len(ids), 0.2)
     of_first = ids[mistaken & (true_ids == 3)]
     assert_binomial(int((of_first == 7).sum()), len(of_first), 0.5)
-    lone = detect(world=World(WORLD.landmark_ids[:1], WORLD.landmark_positions[:1], -2.0), wrong_id_rate=1.0)
+    lone = detect(world=simulated.World(WORLD.landmark_ids[:1], WORLD.landmark_positions[:1], -2.0), wrong_id_rate=1.0)
     assert np.all(lone.most_probable()[0] == 3)
-
-
-def test_recognised_posteriors_are_confident_and_leave_room_for_none():
-    found = detect()
-    np.testing.assert_allclose(np.sort(found.id_probability, axis=1), np.tile([0.01, 0.01, 0.97], (len(found), 1)))
 
 
 def test_false_detections_come_at_the_stated_rate_all_over_the_fan_and_say_none_unless_confusion_is_asked_for():
@@ -126,10 +115,6 @@ def test_false_detections_come_at_the_stated_rate_all_over_the_fan_and_say_none_
     np.testing.assert_allclose(found.id_probability.sum(axis=1), 0.2)
     confused = detect(detection_probability=0, false_detections_per_frame=0.5, confident_false_fraction=0.3)
     assert_binomial(int((confused.most_probable()[1] > 0.9).sum()), len(confused), 0.3)
-
-
-def test_nothing_in_view_is_no_block():
-    assert detect(world=World(np.array([1]), np.array([[500.0, 0.0, 0.0]]), 0.0)) is None
 
 
 def test_a_share_of_all_detections_names_nothing():
@@ -146,7 +131,7 @@ def test_a_share_of_all_detections_names_nothing():
 
 def test_landmarks_are_numbered_from_one_and_their_heights_obey_the_floor_prior():
     xy = np.arange(2000.0).reshape(1000, 2)
-    landmarks = world_on_floor(xy, -1.7, 0.03, np.random.default_rng(0)).landmark_map()
+    landmarks = simulated.world_on_floor(xy, -1.7, 0.03, np.random.default_rng(0)).landmark_map()
     low, high = stats.chi2.interval(0.9999, 1000)
     assert low < np.sum(((landmarks.positions[:, 2] + 1.7) / 0.03) ** 2) < high
     np.testing.assert_array_equal(landmarks.positions[:, :2], xy)
@@ -169,7 +154,7 @@ def tracks_of(found: LandmarkDetections) -> list[LandmarkDetections]:
 def test_a_track_is_of_one_landmark_and_has_no_gap(steps: list[tuple[int, int]]):
     landmark = np.array([index for index, _ in steps])
     stamps_ns = np.cumsum([gap for _, gap in steps])
-    watched = Watched.of(landmark, stamps_ns)
+    watched = simulated.Watched.of(landmark, stamps_ns)
     for number, true in enumerate(watched.landmark.tolist()):
         rows = np.flatnonzero(watched.track == number)
         assert set(landmark[rows].tolist()) == {true}

@@ -36,18 +36,14 @@ def test_changing_the_sonar_leaves_all_other_noise_alone():
         np.testing.assert_array_equal(first, second)
 
 
-def test_stamps_begin_together_and_truth_covers_the_run():
-    run = short()
+def test_stamps_begin_together_truth_covers_the_run_and_frames_fall_between_imu_samples():
+    run = short(false_detections_per_frame=2.0)
     assert run.imu.stamps_ns[0] == run.dvl.stamps_ns[0] == run.start_ns == run.truth.stamps_ns[0]
     assert run.truth.stamps_ns[-1] >= run.end_ns
     assert run.duration_s == pytest.approx(130, abs=0.2)
     assert np.isnan(run.truth.covariances).all()
-
-
-def test_rows_of_a_frame_share_a_stamp_and_frames_fall_between_imu_samples():
-    found = short(false_detections_per_frame=2.0).detections
-    frames = np.unique(found.stamps_ns)
-    assert len(frames) < len(found)
+    frames = np.unique(run.detections.stamps_ns)
+    assert len(frames) < len(run.detections), "rows of a frame share a stamp"
     assert np.all(np.diff(frames) % 200_000_000 <= 1)
     assert np.isin((frames - 1_400_000_000_000_000_000) % 10_000_000, [7_100_000, 7_100_001]).all()
 

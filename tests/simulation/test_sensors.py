@@ -9,16 +9,7 @@ from scipy import stats
 
 from sonar_graph.calibration import DepthCalibration, DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.measurements import Floats
-from sonar_graph.simulation.sensors import (
-    EPOCH_NS,
-    dvl_readings,
-    imu_readings,
-    regular_stamps,
-    seconds_since_start,
-    simulate_depth,
-    simulate_dvl,
-    simulate_imu,
-)
+from sonar_graph.simulation import sensors
 from sonar_graph.simulation.vehicle import VehiclePath, smooth_noise
 
 G = 9.80665
@@ -40,27 +31,27 @@ def still(rpy: tuple[float, float, float] = (0.0, 0.0, 0.0), duration_s: float =
 
 def imu_of(calibration: ImuCalibration, rate_hz: float, duration_s: float, seed: int) -> tuple[Floats, Floats]:
     """Errors of angular velocity and specific force at rest."""
-    stamps_ns = regular_stamps(rate_hz, duration_s)
-    imu = simulate_imu(still(), stamps_ns, calibration, G, np.random.default_rng(seed))
+    stamps_ns = sensors.regular_stamps(rate_hz, duration_s)
+    imu = sensors.simulate_imu(still(), stamps_ns, calibration, G, np.random.default_rng(seed))
     return imu.angular_velocity, imu.specific_force - [0, 0, G]
 
 
 def test_stamps_begin_at_the_epoch_and_stay_within_the_run():
-    stamps = regular_stamps(7.0, 10.0)
-    assert stamps[0] == EPOCH_NS
+    stamps = sensors.regular_stamps(7.0, 10.0)
+    assert stamps[0] == sensors.EPOCH_NS
     assert len(stamps) == 71
     assert np.abs(np.diff(stamps) - 1e9 / 7).max() <= 1
-    assert regular_stamps(5.0, 10.0, offset_s=0.03)[-1] <= EPOCH_NS + 10_000_000_000
+    assert sensors.regular_stamps(5.0, 10.0, offset_s=0.03)[-1] <= sensors.EPOCH_NS + 10_000_000_000
 
 
 @given(st.tuples(st.floats(-3, 3), st.floats(-1.4, 1.4), st.floats(-3, 3)))
 @settings(max_examples=20)
 def test_a_vehicle_at_rest_feels_gravity_along_the_worlds_up(rpy: tuple[float, float, float]):
-    omega, force = imu_readings(still().at(SECONDS), Mounting(), G)
+    omega, force = sensors.imu_readings(still().at(SECONDS), Mounting(), G)
     np.testing.assert_allclose(omega, 0, atol=1e-9)
     np.testing.assert_allclose(force, np.tile([0, 0, G], (121, 1)), atol=1e-8)
     up_in_imu = (gtsam.Rot3.RzRyRx(*rpy) * gtsam.Rot3.RzRyRx(*SKEWED.rpy_rad)).unrotate(np.array([0, 0, 1.0]))
-    _, force = imu_readings(still(rpy).at(SECONDS[:1]), SKEWED, G)
+    _, force = sensors.imu_readings(still(rpy).at(SECONDS[:1]), SKEWED, G)
     np.testing.assert_allclose(force[0], G * up_in_imu, atol=1e-7)
 
 
@@ -68,18 +59,15 @@ def test_gtsam_integrates_exact_imu_samples_back_to_the_truth():
     path, step = moving(), 1e-3
     begins = np.arange(0, 10 - step / 2, step)
     # Its integrator holds rate and force over a step and turns the force by the attitude at the step's begin.
-    omegas, _ = imu_readings(path.at(begins + step / 2), Mounting(), G)
-    _, forces = imu_readings(path.at(begins), Mounting(), G)
-    integrated = gtsam.PreintegratedImuMeasurements(
-        gtsam.PreintegrationParams.MakeSharedU(G), gtsam.imuBias.ConstantBias()
-    )
+    omegas, _ = sensors.imu_readings(path.at(begins + step / 2), Mounting(), G)
+    _, forces = sensors.imu_readings(path.at(begins), Mounting(), G)
+    params, no_bias = gtsam.PreintegrationParams.MakeSharedU(G), gtsam.imuBias.ConstantBias()
+    integrated = gtsam.PreintegratedImuMeasurements(params, no_bias)
     for omega, force in zip(omegas, forces, strict=True):
         integrated.integrateMeasurement(force, omega, step)
     first, last = path.at(np.array([0.0])), path.at(np.array([10.0]))
-    begin = gtsam.NavState(
-        gtsam.Pose3(gtsam.Rot3(first.world_R_body.as_matrix()[0]), first.position[0]), first.velocity[0]
-    )
-    end = integrated.predict(begin, gtsam.imuBias.ConstantBias())
+    pose = gtsam.Pose3(gtsam.Rot3(first.world_R_body.as_matrix()[0]), first.position[0])
+    end = integrated.predict(gtsam.NavState(pose, first.velocity[0]), no_bias)
     np.testing.assert_allclose(end.position(), last.position[0], atol=2e-3)
     np.testing.assert_allclose(end.velocity(), last.velocity[0], atol=5e-4)
     np.testing.assert_allclose(end.attitude().matrix(), last.world_R_body.as_matrix()[0], atol=1e-5)
@@ -98,8 +86,8 @@ def test_sensors_on_a_lever_arm_feel_that_points_velocity_and_acceleration():
     acceleration = (after - 2 * at + before) / 1e-3**2 + np.array([0, 0, G])
     before, after = (points_of_mounting(path, middle + d, SKEWED.translation_m) for d in (-1e-4, 1e-4))
     for exact, expected, atol in (
-        (lambda mounting: imu_readings(motion, mounting, G)[1], acceleration, 1e-5),
-        (lambda mounting: dvl_readings(motion, mounting), (after - before) / 2e-4, 1e-7),
+        (lambda mounting: sensors.imu_readings(motion, mounting, G)[1], acceleration, 1e-5),
+        (lambda mounting: sensors.dvl_readings(motion, mounting), (after - before) / 2e-4, 1e-7),
     ):
         expected = np.einsum("nji,nj->ni", world_R_sensor, expected)
         np.testing.assert_allclose(exact(SKEWED), expected, atol=atol)
@@ -141,21 +129,21 @@ def test_gyro_bias_walks_with_the_root_of_time():
 
 def test_dvl_noise_is_what_its_covariance_column_says_and_scale_error_stretches_velocity():
     calibration = DvlCalibration(velocity_sigma_m_s=(0.004, 0.008, 0.016), mounting=SKEWED)
-    path, stamps = moving(), regular_stamps(100, 60)
-    exact = dvl_readings(path.at(seconds_since_start(stamps)), SKEWED)
-    dvl = simulate_dvl(path, stamps, calibration, np.random.default_rng(6))
+    path, stamps = moving(), sensors.regular_stamps(100, 60)
+    exact = sensors.dvl_readings(path.at(sensors.seconds_since_start(stamps)), SKEWED)
+    dvl = sensors.simulate_dvl(path, stamps, calibration, np.random.default_rng(6))
     for axis in range(3):
         assert_sigma((dvl.velocity - exact)[:, axis], float(np.sqrt(dvl.velocity_cov[0, axis, axis])))
     np.testing.assert_allclose(np.sqrt(np.diag(dvl.velocity_cov[-1])), calibration.velocity_sigma_m_s)
     quiet = calibration.model_copy(update={"velocity_sigma_m_s": (1e-15, 1e-15, 1e-15)})
-    stretched = simulate_dvl(path, stamps, quiet, np.random.default_rng(0), scale_error=0.05)
+    stretched = sensors.simulate_dvl(path, stamps, quiet, np.random.default_rng(0), scale_error=0.05)
     np.testing.assert_allclose(stretched.velocity, 1.05 * exact, atol=1e-12)
 
 
 def test_dvl_dropouts_leave_gaps_of_their_length_at_their_rate():
-    path, stamps = still(duration_s=3600.0), regular_stamps(7, 3600)
+    path, stamps = still(duration_s=3600.0), sensors.regular_stamps(7, 3600)
     faulty, whole, lost = (
-        simulate_dvl(path, stamps, DvlCalibration(), np.random.default_rng(8), **faults)
+        sensors.simulate_dvl(path, stamps, DvlCalibration(), np.random.default_rng(8), **faults)
         for faults in ({"dropouts_per_hour": 60, "dropout_s": 5.0}, {}, {"dropouts_per_hour": 1e5})
     )
     assert len(whole) == len(stamps)
@@ -168,9 +156,9 @@ def test_dvl_dropouts_leave_gaps_of_their_length_at_their_rate():
 
 def test_depth_is_the_height_of_the_port_with_the_stated_noise():
     calibration = DepthCalibration(sigma_m=0.02, port_m=(0.5, -0.3, 0.4))
-    path, stamps = moving(), regular_stamps(50, 60)
-    depth = simulate_depth(path, stamps, calibration, np.random.default_rng(9))
-    seconds = seconds_since_start(stamps)
+    path, stamps = moving(), sensors.regular_stamps(50, 60)
+    depth = sensors.simulate_depth(path, stamps, calibration, np.random.default_rng(9))
+    seconds = sensors.seconds_since_start(stamps)
     error = depth.z_m - points_of_mounting(path, seconds, calibration.port_m)[:, 2]
     assert_sigma(error, 0.02)
     np.testing.assert_allclose(depth.variance_m2, 0.0004)

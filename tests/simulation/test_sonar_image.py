@@ -13,17 +13,9 @@ from sonar_graph.calibration import SonarImage
 from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.measurements import Floats
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
+from sonar_graph.simulation.sonar_image import scene
 from sonar_graph.simulation.sonar_image.frames import FrameSimulator, drawn_gain_error_db
 from sonar_graph.simulation.sonar_image.imaging_sonar import SONARS, ImageOptions, ImagingSonar
-from sonar_graph.simulation.sonar_image.scene import (
-    CELL_M,
-    CELLS,
-    SeabedObject,
-    block,
-    place,
-    place_landmark,
-    scatterers,
-)
 
 HEIGHT_M = 0.95
 TILT = Rotation.from_euler("ZYX", [0, 30, 0], degrees=True)
@@ -43,7 +35,7 @@ def floor_of(changes: tuple[tuple[str, object], ...], seed: int, sonar: ImagingS
 
 
 def simulator(
-    objects: list[SeabedObject] | None = None, seed: int = 0, sonar: ImagingSonar | None = None, **changes: object
+    objects: list[scene.SeabedObject] | None = None, seed: int = 0, sonar: ImagingSonar | None = None, **changes: object
 ) -> FrameSimulator:
     """One floor for each set of options, with other objects on it at each call."""
     made = copy(floor_of(tuple(sorted(changes.items())), seed, sonar))
@@ -51,10 +43,10 @@ def simulator(
     return made
 
 
-def box_at(x_m: float, *size_and_level: float, y_m: float = 0.0) -> SeabedObject:
+def box_at(x_m: float, *size_and_level: float, y_m: float = 0.0) -> scene.SeabedObject:
     """A box on the floor; length, width, height and decibels over the floor."""
     radius_m = max(size_and_level[:2]) / 2 + 0.06
-    return place(-1, "box", block(*size_and_level), radius_m, np.array([x_m, y_m, 0.0]), 0.0)
+    return scene.place(-1, "box", scene.block(*size_and_level), radius_m, np.array([x_m, y_m, 0.0]), 0.0)
 
 
 def level_db(made: FrameSimulator, x_m: float = 0.0, y_m: float = 0.0, number: int = 0) -> Floats:
@@ -178,7 +170,7 @@ def test_landmark_lies_where_geometry_says_and_left_is_positive(index: int):
     design, bearing, yaw_rad = DEFAULT_DESIGNS[index], np.radians((-9.0, 4.0)[index % 2]), 0.7
     position = np.array([1.7 * np.cos(bearing), 1.7 * np.sin(bearing), 0.02])
     flush = replace(design, height_m=0.0)  # the edge that faces the sonar would glint
-    made = simulator([place_landmark(flush, position, yaw_rad, 0.0)], speckle="frame")
+    made = simulator([scene.place_landmark(flush, position, yaw_rad, 0.0)], speckle="frame")
     mean_db = 10 * np.log10(np.mean([intensity(made, number=n) for n in range(24)], axis=0))
     seen, expected = mean_db > 45, polar_picture(design, position, yaw_rad, made)
     assert np.sum(seen & expected) / np.sum(seen | expected) > 0.85
@@ -198,7 +190,7 @@ def test_landmark_is_as_much_brighter_than_the_floor_as_its_mask_says():
 
 def point_response(**changes: object) -> np.ndarray:
     """Level of every beam around a small strong object straight ahead, in dB below its own."""
-    dot = place(-1, "dot", block(0.005, 0.005, 0.0, 140.0), 0.02, np.array([1.75, 0.002, 0.0]), 0.0)
+    dot = scene.place(-1, "dot", scene.block(0.005, 0.005, 0.0, 140.0), 0.02, np.array([1.75, 0.002, 0.0]), 0.0)
     image = level_db(simulator([dot], **changes))
     column = int(np.argmax(image.max(axis=0)))
     return image[:, column] - image[:, column].max()
@@ -340,7 +332,7 @@ MIDDLE_M, FRAMES = 1.6, 16
 LENGTH_M, WIDTH_M = 0.06, 0.2
 
 
-def ramp(rise: float) -> SeabedObject:
+def ramp(rise: float) -> scene.SeabedObject:
     """Rises away from the sonar; only its middle scatters to speak of, by 60 dB over the floor."""
 
     def shape(x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
@@ -348,7 +340,7 @@ def ramp(rise: float) -> SeabedObject:
         rises = (np.abs(x_m) < 0.08) & (np.abs(y_m) < 0.15)
         return np.where(is_bright, 60.0, np.nan), np.where(rises, rise * (x_m + 0.08), 0.0)
 
-    return place(-1, "ramp", shape, 0.2, np.array([MIDDLE_M, 0.0, 0.0]), 0.0)
+    return scene.place(-1, "ramp", shape, 0.2, np.array([MIDDLE_M, 0.0, 0.0]), 0.0)
 
 
 def energy_of_ramp(rise: float, floor_reflection: float | None = None) -> float:
@@ -392,9 +384,9 @@ def test_a_steep_face_echoes_by_way_of_the_floor_there_and_back():
 
 def test_strength_of_the_floor_is_smooth_over_three_centimetres():
     """A Gaussian field whose correlation falls to 1/e at 3 cm; a Gamma of shape 50 is nearly one."""
-    strength = scatterers(50.0, False, np.random.default_rng(3)).texture.astype(float) ** 2
+    strength = scene.scatterers(50.0, False, np.random.default_rng(3)).texture.astype(float) ** 2
     power = np.mean(np.abs(np.fft.fft(strength - strength.mean(), axis=1)) ** 2, axis=0)
-    correlation, distance_m = np.fft.ifft(power).real, np.arange(CELLS) * CELL_M  # periodic, along x
+    correlation, distance_m = np.fft.ifft(power).real, np.arange(scene.CELLS) * scene.CELL_M  # periodic, along x
     near = distance_m < 0.08
     expected = np.exp(-((distance_m[near] / 0.03) ** 2))
     np.testing.assert_allclose(correlation[near] / correlation[0], expected, atol=0.05)
@@ -403,7 +395,7 @@ def test_strength_of_the_floor_is_smooth_over_three_centimetres():
 
 
 def test_amplitudes_are_of_a_complex_normal_law_and_joints_stand_out_of_an_even_floor_by_six_decibels():
-    even, jointed = (scatterers(None, joints, np.random.default_rng(3)) for joints in (False, True))
+    even, jointed = (scene.scatterers(None, joints, np.random.default_rng(3)) for joints in (False, True))
     np.testing.assert_array_equal(even.texture, 1.0)
     on = jointed.texture > 1
     np.testing.assert_allclose(20 * np.log10(jointed.texture[on]), 6.0, atol=1e-5)

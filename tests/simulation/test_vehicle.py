@@ -12,8 +12,6 @@ from scipy.integrate import cumulative_simpson
 from sonar_graph.simulation.vehicle import VehiclePath, drive, follow, hover, rpy_from_rotation, smooth_noise, turn
 
 SECONDS = np.linspace(0, 10, 41)
-
-
 WANDER = smooth_noise(SECONDS, np.array([1.0, 1.0, 1.0, 0.6, 0.6, 1.5]), 2.0, 6, np.random.default_rng(3))
 PATH = VehiclePath.through(SECONDS, WANDER)
 

@@ -178,9 +178,8 @@ def test_the_rim_of_the_image_does_not_push_a_landmark_aside(appearance, design)
 
 
 APERTURE_RAD = 0.244
-MODEL = confusion_for(DEFAULT_DESIGNS).model_copy(
-    update={"threshold": 0.7, "range_sigma_m": 0.01, "azimuth_sigma_rad": 0.004}
-)
+SETTINGS = {"threshold": 0.7, "range_sigma_m": 0.01, "azimuth_sigma_rad": 0.004}
+MODEL = confusion_for(DEFAULT_DESIGNS).model_copy(update=SETTINGS)
 TRIANGLE = 2
 
 
@@ -207,15 +206,12 @@ def triangle() -> np.ndarray:
     return image_db(DEFAULT_DESIGNS[TRIANGLE], (1.7, 0.05), 0.5, ROTATION, np.random.default_rng(0))
 
 
-def test_range_and_azimuth_are_those_of_the_designs_centre_and_not_of_the_candidate(appearance, triangle):
+def test_range_and_azimuth_are_those_of_the_centre_and_less_certain_where_partly_in_view(appearance, triangle):
     found = look_at(appearance, triangle, (1.725, 0.03))
     r, a = VIEW.range_azimuth(np.array([1.7, 0.05]))
     assert (found.is_fitted, found.fit.best) == (True, TRIANGLE)
     assert (found.range_m, found.azimuth_rad) == (pytest.approx(r, abs=0.006), pytest.approx(a, abs=0.004))
     np.testing.assert_allclose(found.covariance, np.diag([0.01**2, 0.004**2]) / found.fit.visible**4)
-
-
-def test_what_is_partly_in_view_is_less_certain(appearance):
     found = look_at(appearance, image_db(DEFAULT_DESIGNS[0], (1.7, 0.34), 0.0), (1.7, 0.33))
     assert found.is_fitted
     assert 0.8 <= found.fit.visible < 0.97
@@ -279,12 +275,8 @@ def test_without_a_floor_the_patch_lies_in_the_plane_of_the_image(appearance):
     level = np.nan_to_num(DEFAULT_DESIGNS[1].level_db(r * np.cos(a) - 1.9, r * np.sin(a) - 0.1)) + 35.0
     image = (level + 10 * np.log10(np.random.default_rng(3).exponential(size=level.shape))).astype(np.float32)
     r, a = np.hypot(1.9, 0.1), np.arctan2(0.1, 1.9)
-    flat, tilted = (
-        CandidateFit(appearance, MODEL, APERTURE_RAD).at(
-            image, frame(image), view, candidates_at([r], [a]), np.array([0])
-        )[0]
-        for view in (None, VIEW)
-    )
+    candidate, look = candidates_at([r], [a]), CandidateFit(appearance, MODEL, APERTURE_RAD)
+    flat, tilted = (look.at(image, frame(image), view, candidate, np.array([0]))[0] for view in (None, VIEW))
     assert flat.fit.best == 1
     assert (flat.range_m, flat.azimuth_rad) == (pytest.approx(r, abs=0.006), pytest.approx(a, abs=0.003))
     assert tilted.fit is None or tilted.fit.correlation[1] < flat.fit.correlation[1] - 0.02

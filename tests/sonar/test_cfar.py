@@ -11,16 +11,8 @@ from scipy.ndimage import uniform_filter
 from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.errors import CalibrationError, MeasurementError
 from sonar_graph.measurements import Floats
+from sonar_graph.sonar import cfar
 from sonar_graph.sonar.appearance import AppearanceParams
-from sonar_graph.sonar.cfar import (
-    DetectionParams,
-    bright_parts,
-    check_candidates,
-    false_alarm_offset_db,
-    false_alarm_offsets_db,
-    odd_counts,
-    select_candidates,
-)
 from sonar_graph.sonar.geometry import FloorView
 from sonar_graph.sonar.regions import MEDIAN_TO_SIGMA, CandidateVerdict, background_of, measure_regions
 
@@ -50,7 +42,7 @@ def frame_with_plate(x=1.65, y=0.05, side=0.3, plate_db=PLATE_DB):
 
 
 def select(image, view=VIEW, **settings):
-    return select_candidates(image, RANGES_M, AZIMUTHS_RAD, view, DetectionParams(**settings))
+    return cfar.select_candidates(image, RANGES_M, AZIMUTHS_RAD, view, cfar.DetectionParams(**settings))
 
 
 def shares_over(frames, **settings):
@@ -68,16 +60,16 @@ def test_gaps_up_to_a_width_are_bridged(closing_m, count):
 
 def test_offsets_are_those_of_speckle_of_one_look_and_of_many_and_interpolated_for_images():
     """-ln(0.01) = 4.605 times the mean is 6.63 dB, and the mean of decibels lies 2.51 dB below that of the power."""
-    assert false_alarm_offset_db(5.570, 0.01) == pytest.approx(6.632 + 2.507, abs=0.01)
+    assert cfar.false_alarm_offset_db(5.570, 0.01) == pytest.approx(6.632 + 2.507, abs=0.01)
     for looks in (1, 4, 20):
         levels = 10 * np.log10(stats.gamma(looks).rvs(1_000_000, random_state=4))
-        offset = false_alarm_offset_db(float(np.std(levels)), 1e-2)
+        offset = cfar.false_alarm_offset_db(float(np.std(levels)), 1e-2)
         assert np.mean(levels > np.mean(levels) + offset) == pytest.approx(1e-2, rel=0.06)
     spreads = np.array([0.3, 1.23, 5.57, 8.0], dtype=np.float32)
-    exact = [false_alarm_offset_db(float(spread), 1e-3) for spread in spreads]
-    assert false_alarm_offsets_db(spreads, 1e-3) == pytest.approx(exact, abs=0.02)
+    exact = [cfar.false_alarm_offset_db(float(spread), 1e-3) for spread in spreads]
+    assert cfar.false_alarm_offsets_db(spreads, 1e-3) == pytest.approx(exact, abs=0.02)
     cell_m = 1.885 * np.radians(0.3), 1.25 / 512
-    assert [odd_counts(length_m, cell_m) for length_m in (0.03, 0.0)] == [(3, 13), (1, 1)]  # beams and bins
+    assert [cfar.odd_counts(length_m, cell_m) for length_m in (0.03, 0.0)] == [(3, 13), (1, 1)]  # beams and bins
 
 
 ACROSS = np.linspace(-1.0, 1.0, 96)[:, None]
@@ -104,7 +96,7 @@ def test_texture_raises_the_threshold_by_itself():
     textures = [np.kron(rng.gamma(1.0, size=(32, 32)), np.ones((3, 16))) for _ in range(8)]
     images = [speckle_db(seed) + 10 * np.log10(texture) for seed, texture in enumerate(textures)]
     smooth = np.mean(np.reshape(images, (8, 32, 3, 32, 16)), axis=(2, 4))
-    fixed = np.median(smooth, axis=(1, 2), keepdims=True) + false_alarm_offset_db(5.57 / np.sqrt(48), 1e-2)
+    fixed = np.median(smooth, axis=(1, 2), keepdims=True) + cfar.false_alarm_offset_db(5.57 / np.sqrt(48), 1e-2)
     assert shares_over(images, false_alarm=1e-2).mean() < 2e-2
     assert np.mean(smooth > fixed) > 0.2
 
@@ -225,7 +217,7 @@ def test_the_background_is_a_median_and_the_spread_the_median_of_what_is_left(no
     assert spread_db == pytest.approx(np.maximum(spread, 0.2), abs=tolerance)
 
 
-PARAMS = DetectionParams()
+PARAMS = cfar.DetectionParams()
 SEARCH_M = AppearanceParams().search_m
 PIXELS = 200
 
@@ -244,7 +236,7 @@ def accepted_near_middle(design: LandmarkDesign) -> int:
     """Candidates of the selection itself, in an image without speckle but for a little, close enough to be compared."""
     image = image_db(design, (1.7, 0.0), 0.0)
     image = image + np.random.default_rng(0).normal(0, 0.5, image.shape).astype(np.float32)
-    found = select_candidates(image, RANGES_M, polar_images.AZIMUTHS_RAD, polar_images.VIEW, PARAMS)
+    found = cfar.select_candidates(image, RANGES_M, polar_images.AZIMUTHS_RAD, polar_images.VIEW, PARAMS)
     r, a = found.range_m[found.accepted], found.azimuth_rad[found.accepted]
     away = np.hypot(r * np.sin(a), np.sqrt(r**2 - HEIGHT_M**2) * np.cos(a) - 1.7)
     return int((away <= SEARCH_M + PARAMS.smoothing_m).sum())
@@ -259,13 +251,13 @@ BAR, BESIDE = design_of((0.0, 0.0, 0.22, 0.04)), design_of((0.06, 0.0, 0.1, 0.1)
 DARK_APART = replace(ONE, mask=np.where(np.isnan(ONE.mask) & (np.indices(ONE.mask.shape)[0] < 20), -8.0, ONE.mask))
 
 
-def set_to(**settings: float) -> DetectionParams:
+def set_to(**settings: float) -> cfar.DetectionParams:
     return PARAMS.model_copy(update=settings)
 
 
 def is_refused(design: LandmarkDesign, search_m: float = SEARCH_M, **settings: float) -> bool:
     try:
-        check_candidates([design], set_to(**settings), search_m)
+        cfar.check_candidates([design], set_to(**settings), search_m)
     except CalibrationError as error:
         return f"{design.name} (id {design.id}) would never be found: its bright parts are" in str(error)
     return False
@@ -306,28 +298,28 @@ def test_one_part_must_have_the_size_and_the_place():
 
 def test_a_refusal_names_areas_distances_limits_and_settings():
     with pytest.raises(CalibrationError, match=r" m² with its centre 21 cm .* within 8 cm of .*closing_m"):
-        check_candidates([AT_A_CORNER], PARAMS, 0.045)
+        cfar.check_candidates([AT_A_CORNER], PARAMS, 0.045)
     with pytest.raises(CalibrationError, match="its bright parts are all smoothed away; one must have"):
-        check_candidates([TINY], set_to(smoothing_m=0.1), SEARCH_M)
+        cfar.check_candidates([TINY], set_to(smoothing_m=0.1), SEARCH_M)
 
 
 def test_parts_have_the_area_length_and_place_of_their_drawing_largest_first():
-    areas_m2, extents_m, offsets_m = bright_parts(design_of((0.1, 0.05, 0.1, 0.05)), PARAMS)
+    areas_m2, extents_m, offsets_m = cfar.bright_parts(design_of((0.1, 0.05, 0.1, 0.05)), PARAMS)
     assert areas_m2 == pytest.approx([0.02], rel=0.25)
     assert extents_m == pytest.approx([0.2], rel=0.1)
     assert offsets_m == pytest.approx([np.hypot(0.1, 0.05)], abs=0.003)
-    areas_m2, _, offsets_m = bright_parts(design_of((-0.15, 0.0, 0.03, 0.03), (0.1, 0.0, 0.1, 0.1)), PARAMS)
+    areas_m2, _, offsets_m = cfar.bright_parts(design_of((-0.15, 0.0, 0.03, 0.03), (0.1, 0.0, 0.1, 0.1)), PARAMS)
     assert areas_m2[0] > 4 * areas_m2[1]
     assert offsets_m == pytest.approx([0.1, 0.15], abs=0.005)
-    assert len(bright_parts(TINY, set_to(closing_m=0.1))[0]) == 1  # closing does not average
+    assert len(cfar.bright_parts(TINY, set_to(closing_m=0.1))[0]) == 1  # closing does not average
     touching = design_of((-0.0525, -0.0525, 0.05, 0.05), (0.05, 0.045, 0.05, 0.05))  # at a corner: one part
-    areas_m2, _, _ = bright_parts(touching, set_to(smoothing_m=0.005, closing_m=0.0))
+    areas_m2, _, _ = cfar.bright_parts(touching, set_to(smoothing_m=0.005, closing_m=0.0))
     assert areas_m2 == pytest.approx([0.02], rel=0.1)
 
 
 def test_a_part_is_where_the_mean_over_the_smoothing_is_over_the_floor():
     """Against scipy, in cells of 2 mm; 3 dB of 12 are reached beyond the edge."""
-    areas_m2, extents_m, _ = bright_parts(design_of((0.0, 0.0, 0.2, 0.1)), set_to(smoothing_m=0.1))
+    areas_m2, extents_m, _ = cfar.bright_parts(design_of((0.0, 0.0, 0.2, 0.1)), set_to(smoothing_m=0.1))
     x_m, y_m = np.meshgrid(*2 * [0.002 * np.arange(-200, 201)])
     is_part = uniform_filter(np.where((np.abs(x_m) <= 0.2) & (np.abs(y_m) <= 0.1), 12.0, 0.0), 50) >= 3.0
     assert areas_m2 == pytest.approx([is_part.sum() * 0.002**2], rel=0.05)
@@ -338,6 +330,6 @@ def test_a_part_is_where_the_mean_over_the_smoothing_is_over_the_floor():
 @pytest.mark.parametrize("settings", [{}, {"smoothing_m": 0.1}, {"closing_m": 0.1}])
 def test_the_edge_of_the_square_is_none_of_a_part(settings):
     """The same box, in a square that it fills and in a larger one."""
-    filled, larger = (bright_parts(design_of(MIDDLE, size_m=size_m), set_to(**settings)) for size_m in (0.2, 0.5))
+    filled, larger = (cfar.bright_parts(design_of(MIDDLE, size_m=size_m), set_to(**settings)) for size_m in (0.2, 0.5))
     for one, other in zip(filled, larger, strict=True):
         assert one == pytest.approx(other, rel=0.06, abs=0.003)

@@ -83,6 +83,7 @@ def test_a_window_is_used_from_its_second_frame_on_and_the_change_is_told_once()
 
 
 def test_windows_that_alternate_lose_one_frame_and_one_that_a_driver_computes_anew_for_every_ping_is_the_same():
+    """And of ever new ones a limited number is remembered."""
     check = FrameCheck()
     faults = [check.fault(_frame(stamp, end_m=2.0 + stamp % 2)) for stamp in range(1, 9)]
     assert [number for number, fault in enumerate(faults) if fault] == [1]
@@ -90,9 +91,6 @@ def test_windows_that_alternate_lose_one_frame_and_one_that_a_driver_computes_an
     for stamp in range(1, 20):
         assert check.fault(_frame(stamp, end_m=2.0 + 0.2 / (BINS - 1) * (-1) ** stamp)) is None
         assert check.change is None
-
-
-def test_windows_that_are_remembered_do_not_grow_without_limit():
     check = FrameCheck()
     for k in range(200):
         check.fault(_frame(k + 1, end_m=2.0 + 0.5 * k))
