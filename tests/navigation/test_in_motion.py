@@ -23,23 +23,36 @@ from .ways import acceleration_at, attitude, rate_at, velocity_at
 T = np.arange(round(15.0 * 100) + 1) / 100
 G, HZ, DVL_EVERY = 9.80665, 100, 20
 EARTH, LATITUDE = 7.292115e-5, np.radians(40.0)
-IMU_AT, DVL_AT = np.array([0.4, -0.1, 0.2]), np.array([-0.5, 0.3, -0.2])
-KNOWN = Calibration(
-    imu=ImuCalibration(
-        gyro_noise_density=1e-4,
-        gyro_bias_sigma=1e-3,
-        accel_noise_density=1e-3,
-        accel_bias_sigma=1e-2,
-        mounting=Mounting(translation_m=tuple(IMU_AT)),
-    ),
-    dvl=DvlCalibration(velocity_sigma_m_s=(0.005, 0.005, 0.005)),
-)
-WITH_EARTH = KNOWN.model_copy(update={"earth_rate_latitude_rad": LATITUDE})
-FIBRE = WITH_EARTH.model_copy(
-    update={"imu": KNOWN.imu.model_copy(update={"gyro_noise_density": 5e-6, "gyro_bias_sigma": 3e-6})}
-)
+IMU_AT = np.array([0.4, -0.1, 0.2])
+
+
+def calibration(
+    gyro: float,
+    gyro_bias: float,
+    accel: float,
+    accel_bias: float,
+    latitude: float | None = None,
+    imu_rpy: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    dvl: Mounting | None = None,
+) -> Calibration:
+    return Calibration(
+        imu=ImuCalibration(
+            gyro_noise_density=gyro,
+            gyro_bias_sigma=gyro_bias,
+            accel_noise_density=accel,
+            accel_bias_sigma=accel_bias,
+            mounting=Mounting(translation_m=tuple(IMU_AT), rpy_rad=imu_rpy),
+        ),
+        dvl=DvlCalibration(velocity_sigma_m_s=(0.005, 0.005, 0.005), mounting=dvl or Mounting()),
+        earth_rate_latitude_rad=latitude,
+    )
+
+
+KNOWN = calibration(1e-4, 1e-3, 1e-3, 1e-2)
+WITH_EARTH = calibration(1e-4, 1e-3, 1e-3, 1e-2, LATITUDE)
+FIBRE = calibration(5e-6, 3e-6, 1e-3, 1e-2, LATITUDE)
 """Gyros to which the Earth's rate is large."""
-COARSE = KNOWN.model_copy(update={"imu": KNOWN.imu.model_copy(update={"gyro_noise_density": 1e-3})})
+COARSE = calibration(1e-3, 1e-3, 1e-3, 1e-2)
 """Gyros whose noise matters more than all else."""
 
 
@@ -226,24 +239,12 @@ SHORT_HZ, SHORT_EVERY = 10, 2
 SHORT_T = np.arange(round(2.4 * SHORT_HZ) + 1) / SHORT_HZ
 YAW = 0.8
 IMU_RPY, DVL_RPY = (0.2, -0.4, 1.0), (0.1, 0.5, -0.8)
+IN_PLACE, APART = (
+    {"imu_rpy": IMU_RPY, "dvl": Mounting(translation_m=at, rpy_rad=DVL_RPY)}
+    for at in (tuple(IMU_AT), (-0.5, 0.3, -0.2))
+)
 ROOT = np.array([[0.006, 0.0, 0.0], [0.002, 0.003, 0.0], [-0.001, 0.002, 0.008]])
 """Of the covariance of every velocity."""
-
-
-def calibration(
-    gyro: float, gyro_bias: float, accel: float, accel_bias: float, latitude: float | None = None, dvl_at=DVL_AT
-) -> Calibration:
-    return Calibration(
-        imu=ImuCalibration(
-            gyro_noise_density=gyro,
-            gyro_bias_sigma=gyro_bias,
-            accel_noise_density=accel,
-            accel_bias_sigma=accel_bias,
-            mounting=Mounting(translation_m=tuple(IMU_AT), rpy_rad=IMU_RPY),
-        ),
-        dvl=DvlCalibration(mounting=Mounting(translation_m=tuple(dvl_at), rpy_rad=DVL_RPY)),
-        earth_rate_latitude_rad=latitude,
-    )
 
 
 def turned_by(rpy: tuple[float, float, float], vectors: Floats) -> Floats:
@@ -295,10 +296,10 @@ def error_spread(known: Calibration, earth: float) -> Floats:
 @pytest.mark.parametrize(
     ("known", "earth", "tolerance"),
     [
-        (calibration(1e-3, 1e-3, 0.0, 1e-5, dvl_at=IMU_AT), 0.0, 0.05),
-        (calibration(1e-3, 1e-3, 0.0, 1e-5), 0.0, 0.07),  # that a rate's noise also turns the path is left out
-        (calibration(0.0, 1e-2, 2e-3, 1e-2), 0.0, 0.003),
-        (calibration(0.0, 1e-7, 0.0, 1e-5, LATITUDE), EARTH, 0.003),
+        (calibration(1e-3, 1e-3, 0.0, 1e-5, **IN_PLACE), 0.0, 0.05),
+        (calibration(1e-3, 1e-3, 0.0, 1e-5, **APART), 0.0, 0.07),  # that a rate's noise also turns the path is left out
+        (calibration(0.0, 1e-2, 2e-3, 1e-2, **APART), 0.0, 0.003),
+        (calibration(0.0, 1e-7, 0.0, 1e-5, LATITUDE, **APART), EARTH, 0.003),
     ],
     ids=["gyros in one place", "gyros at a lever", "accelerometers", "the Earth"],
 )

@@ -7,8 +7,6 @@ from gtsam.symbol_shorthand import B, L, X
 
 from sonar_graph.measurements import Floats
 from sonar_graph.slam.models import factors
-from sonar_graph.slam.smoother import batch_solution
-from sonar_graph.slam.smoother.batch_solution import solve
 
 from .graphs import block_of, dense_covariance
 from .made import motion_of, plain, polar, smoother_with
@@ -123,12 +121,3 @@ def in_the_basin(
             seen.add(i)
         fed.smoother.update(float(k))
     return fed
-
-
-def counted_solves(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Sizes of the graphs that the smoother solves from now on."""
-    sizes: list[int] = []
-    monkeypatch.setattr(
-        batch_solution, "solve", lambda graph, values: sizes.append(graph.size()) or solve(graph, values)
-    )
-    return sizes

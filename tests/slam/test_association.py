@@ -205,16 +205,14 @@ def test_a_pair_is_believed_when_it_is_denser_than_its_rival(sigma: float):
         assert believed(case, Pairing((0,), 0.0), np.array([rival])).size == size
 
 
-def test_two_that_share_a_wide_error_support_each_other():
-    """One alone says nothing beside a rival of 0.2 a unit; two at the right distance from each other do."""
-    rival, case = np.log(np.full(2, 0.2)), shifted()
-    assert believed(case, Pairing((0, 1), 0.0), rival).landmarks == (0, 1)
+def test_two_that_share_a_wide_error_support_each_other_but_not_where_they_may_be_anywhere():
+    """One alone says nothing beside a rival of 0.2 a unit; two at the right distance from each other do.
+
+    Each given the other is denser than a rival of 3 a unit; where both are together is not.
+    """
+    rival, case, both = np.log(np.full(2, 0.2)), shifted(), Pairing((0, 1), 0.0)
+    assert believed(case, both, rival).landmarks == (0, 1)
     assert believed(case, Pairing((0, UNPAIRED), 0.0), rival).size == 0
-
-
-def test_two_that_fit_each_other_but_may_be_anywhere_say_nothing():
-    """Each given the other is denser than a rival of 3 a unit; where both are together is not."""
-    case, both = shifted(), Pairing((0, 1), 0.0)
     e, C = case.of(both.landmarks)
     together = multivariate_normal.logpdf(e, cov=C)
     given_the_other = together - multivariate_normal.logpdf(e[2:], cov=C[2:, 2:])

@@ -225,7 +225,7 @@ def range_variance(dive: Dive) -> float:
 
 
 def test_sightings_wait_until_together_they_have_something_to_tell():
-    """After n sightings range and azimuth are known to 1/n of the noise: the next would add 1/n, and so on."""
+    """After n sightings range and azimuth are known to 1/n of the noise: the next adds 1/n, but a refused one 0."""
     dive, known, waited = waiting(0.45), [], []
     for _ in range(6):
         known.append(0.02**2 / range_variance(dive))
@@ -233,7 +233,9 @@ def test_sightings_wait_until_together_they_have_something_to_tell():
         waited.append(dive.smoother.waiting_gain)
     assert known == pytest.approx([1, 2, 3, 3, 5, 5], rel=1e-3)
     assert waited == pytest.approx([0, 0, 1 / 3, 0, 1 / 5, 2 / 5], rel=1e-3, abs=1e-9)
-    assert dive.outcomes == [Outcome.NEW] + [Outcome.USED] * 6
+    dive.see(0.0, (5, 9.0, 0.0))
+    assert dive.smoother.waiting_gain == waited[-1]
+    assert dive.outcomes == [Outcome.NEW] + [Outcome.USED] * 6 + [Outcome.GATED]
 
 
 @pytest.mark.parametrize("what", ["keyframe", "landmark"])
@@ -248,10 +250,3 @@ def test_what_waits_is_used_with_the_next_keyframe_or_landmark(what):
     else:
         dive.see(0.0, (6, 3.0, 0.3))
     assert range_variance(dive) == pytest.approx(0.02**2 / 4, rel=0.01)
-
-
-def test_a_refused_detection_does_not_add_to_what_waits():
-    dive = waiting(1e9)
-    dive.see(0.0, (5, 9.0, 0.0))
-    assert dive.outcomes[-1] is Outcome.GATED
-    assert dive.smoother.waiting_gain == 0.0

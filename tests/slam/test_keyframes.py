@@ -23,12 +23,11 @@ from sonar_graph.measurements import Depth, Dvl, Imu
 from sonar_graph.navigation.alignment.gravity import earth_rate_in_world
 from sonar_graph.navigation.preintegration.motion import PreintegratedMotion
 from sonar_graph.slam.keyframes import KeyframeParams, Keyframes, positive_definite
+from tests.navigation.rows import NS, T0_NS, dvl, imu, stamps
 
 from .graphs import factors_of
 from .made import smoother_with
 
-NS = 1_000_000_000
-T0_NS = 1_500_000_000 * NS
 G = 9.80665
 NO_BIAS = ImuCalibration(gyro_bias_sigma=0.0)
 EXACT_DVL = DvlCalibration(velocity_sigma_m_s=(1e-7, 1e-7, 1e-7))
@@ -43,14 +42,12 @@ def at(*offsets_s: float) -> np.ndarray:
     return T0_NS + np.round(np.array(offsets_s) * NS).astype(np.int64)
 
 
-def level_imu(until_s: float, rate=(0.0, 0.0, 0.0), hz: float = 20) -> Imu:
-    stamps = at(*(np.arange(round(until_s * hz) + 1) / hz))
-    return Imu(stamps, np.tile(rate, (len(stamps), 1)), np.tile([0.0, 0.0, G], (len(stamps), 1)))
+def level_imu(until_s: float, rate=(0.0, 0.0, 0.0)) -> Imu:
+    return imu(stamps(20, until_s), rate)
 
 
-def steady_dvl(until_s: float, velocity=(0.5, 0.0, 0.0), hz: float = 5) -> Dvl:
-    stamps = at(*(np.arange(round(until_s * hz) + 1) / hz))
-    return Dvl(stamps, np.tile(velocity, (len(stamps), 1)), np.full((len(stamps), 3, 3), np.nan))
+def steady_dvl(until_s: float, velocity=(0.5, 0.0, 0.0)) -> Dvl:
+    return dvl(stamps(5, until_s), velocity)
 
 
 def keyframes_of(calibration: Calibration, policy: KeyframeParams = POLICY) -> Keyframes:
@@ -64,10 +61,10 @@ def driven(
     *,
     rate=(0.0, 0.0, 0.0),
     velocity=(0.5, 0.0, 0.0),
-    imu: Imu | None = None,
+    felt: Imu | None = None,
 ) -> Keyframes:
     keyframes = keyframes_of(calibration)
-    keyframes.add(imu or level_imu(until_s, rate), steady_dvl(until_s, velocity), depth)
+    keyframes.add(felt or level_imu(until_s, rate), steady_dvl(until_s, velocity), depth)
     keyframes.advance(int(at(until_s)[0]))
     return keyframes
 
@@ -162,10 +159,10 @@ def test_every_keyframe_has_its_odometry_and_gravity_and_is_held_on_a_plane():
 
 
 def test_gravity_tells_the_tilt_of_a_tilted_vehicle():
-    start, imu = Start(rpy_rad=(0.1, -0.2, 0.5)), level_imu(2.0)
+    start, level = Start(rpy_rad=(0.1, -0.2, 0.5)), level_imu(2.0)
     up_in_body = Rotation.from_euler("xyz", start.rpy_rad).inv().apply([0, 0, G])
-    felt = replace(imu, specific_force=np.tile(up_in_body, (len(imu), 1)))
-    keyframes = driven(Calibration(imu=NO_BIAS, start=start), 2.0, imu=felt)
+    felt = replace(level, specific_force=np.tile(up_in_body, (len(level), 1)))
+    keyframes = driven(Calibration(imu=NO_BIAS, start=start), 2.0, felt=felt)
     assert np.abs(error_of(keyframes, gtsam.MagPoseFactorPose3)).max() < 1e-9
 
 
@@ -185,7 +182,7 @@ def test_velocity_is_taken_to_the_imu_before_gravity_is():
     t = np.arange(41) / 20
     force = np.column_stack([-((alpha * t) ** 2) * arm, np.full(41, alpha * arm), np.full(41, G)])
     felt = Imu(at(*t), np.outer(alpha * t, [0, 0, 1.0]), force)
-    keyframes = driven(calibration, 2.0, velocity=(0, 0, 0), imu=felt)
+    keyframes = driven(calibration, 2.0, velocity=(0, 0, 0), felt=felt)
     assert np.abs(error_of(keyframes, gtsam.MagPoseFactorPose3)).max() < 2e-5
     assert alpha * arm / G > 1e-2
 
@@ -268,7 +265,7 @@ def test_rows_that_come_between_two_questions_about_one_instant_count(until_s: f
     instants = int(at(1.0)[0]), int(at(1.2)[0])
     before = [asked_twice.motion_since_newest(instant) for instant in instants]
     for keyframes in (asked_twice, at_once):
-        keyframes.add(None, Dvl(at(late_s), np.array([[0.6, 0.0, 0.0]]), np.full((1, 3, 3), np.nan)), None)
+        keyframes.add(None, dvl(at(late_s), (0.6, 0.0, 0.0)), None)
     after, expected = (each.motion_since_newest(instants[1]).i_T_j for each in (asked_twice, at_once))
     assert after.equals(expected, 1e-12)
     assert not after.equals(before[1].i_T_j, 1e-3)

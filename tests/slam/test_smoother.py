@@ -7,6 +7,7 @@ from gtsam.symbol_shorthand import B, L, X
 
 from sonar_graph.calibration import Calibration, Start
 from sonar_graph.slam.models import factors
+from sonar_graph.slam.smoother import batch_solution
 from sonar_graph.slam.smoother.batch_solution import solve
 from sonar_graph.slam.smoother.factor_store import GraphEdit
 from sonar_graph.slam.smoother.incremental import FIRST_RESTART
@@ -17,7 +18,6 @@ from .fed import (
     SONAR,
     Fed,
     assert_is_least_squares,
-    counted_solves,
     in_the_basin,
     on_the_rail,
     ranged,
@@ -43,19 +43,9 @@ def test_on_the_rail_window_and_history_are_least_squares(lag_s):
         assert marginals.marginalCovariance(X(k))[3, 3] == pytest.approx(variance[f"x{k}"], abs=1e-8)
 
 
-def test_the_history_is_solved_anew_when_it_has_grown():
-    fed = in_the_basin(8, FOREVER_S)
-    before, _ = fed.smoother.solve_history()
-    fed.add([point_prior(L(3), np.array([3.5, 1.0, -1.0]), 1e-3)])
-    fed.smoother.update(7.0)
-    after, _ = fed.smoother.solve_history()
-    assert after.atPoint3(L(3)) == pytest.approx([3.5, 1.0, -1.0], abs=0.02)
-    assert not np.allclose(before.atPoint3(L(3)), after.atPoint3(L(3)), atol=0.1)
-
-
-def test_factors_wait_until_they_are_worth_an_update():
+def test_factors_wait_until_they_are_worth_an_update_and_the_history_is_solved_anew():
     fed = in_the_basin(5, 6.0)
-    before = fed.smoother.values.atPoint3(L(3))
+    before, smoothed = (of.atPoint3(L(3)) for of in (fed.smoother.values, fed.smoother.solve_history()[0]))
     fed.add([point_prior(L(3), np.zeros(3), 0.01)])
     assert not fed.smoother.is_due
     fed.smoother.waiting_gain += 0.1
@@ -64,6 +54,7 @@ def test_factors_wait_until_they_are_worth_an_update():
     fed.smoother.update(4.0)
     assert not fed.smoother.is_due
     assert np.linalg.norm(fed.smoother.values.atPoint3(L(3)) - before) > 0.5
+    assert np.linalg.norm(fed.smoother.solve_history()[0].atPoint3(L(3)) - smoothed) > 0.5
 
 
 @pytest.mark.parametrize("lag_s", [FOREVER_S, 3.0])
@@ -149,11 +140,11 @@ def test_what_is_taken_out_was_never_there(monkeypatch, lag_s, oldest, solves):
     fed = on_the_rail(NODES, lag_s)
     fed.smoother.solve_history()
     gone = [(k, i) for k in range(oldest, NODES) for i in (4, 7)]
-    sizes = counted_solves(monkeypatch)
+    solved = counted(monkeypatch, batch_solution, "solve")
     removed = [handle for k, i in gone for handle in fed.handles_on(X(k), L(i))]
     assert len(removed) == 2 * len(gone)
     fed.smoother.exchange(GraphEdit(removed, [], {}, []), END_S)
-    assert len(sizes) == solves
+    assert len(solved) == solves
     assert_all_is_least_squares(fed, with_ranges(gone))
 
 
@@ -186,14 +177,14 @@ def test_after_wrong_factors_are_taken_out_the_estimate_is_that_of_the_others_at
         fed.smoother.update(14.0)
     batch = solve(graph_of(fed.given), fed.smoother.values)
     off_m = [np.linalg.norm(fed.smoother.values.atPoint3(L(3)) - batch.atPoint3(L(3)))]
-    sizes = counted_solves(monkeypatch)
+    solved = counted(monkeypatch, batch_solution, "solve")
     if gives_up:
         fed.smoother._window.isam = Refusing(fed.smoother._window.isam)
     fed.smoother.exchange(GraphEdit(wrong, [], {}, []), 14.0)
     off_m.append(np.linalg.norm(fed.smoother.values.atPoint3(L(3)) - batch.atPoint3(L(3))))
     assert off_m[0] > 0.5
     assert off_m[1] < 1e-3 * off_m[0]
-    assert len(sizes) == int(gives_up)
+    assert len(solved) == int(gives_up)
 
 
 def test_a_landmark_without_factors_leaves_the_graph_and_can_come_back():
@@ -209,12 +200,12 @@ def test_a_landmark_without_factors_leaves_the_graph_and_can_come_back():
 
 
 def test_a_held_keyframe_takes_late_factors_without_solving_the_history(monkeypatch):
-    fed, sizes = on_the_rail(NODES, 0.6, held={X(3): FOREVER_S}), counted_solves(monkeypatch)
+    fed, solved = on_the_rail(NODES, 0.6, held={X(3): FOREVER_S}), counted(monkeypatch, batch_solution, "solve")
     (handles,) = fed.smoother.exchange(GraphEdit([], [ranged(3, 4, 24.0)], {}, []), END_S)
-    assert not sizes
+    assert not solved
     assert_all_is_least_squares(fed, with_ranges([], (3, 4, 24.0)))
     fed.smoother.exchange(GraphEdit(handles, [], {}, []), END_S)
-    assert len(sizes) == 1  # that of the smoothed result above
+    assert len(solved) == 1  # that of the smoothed result above
     assert_all_is_least_squares(fed, NUMBERS)
 
 
@@ -267,11 +258,11 @@ def test_a_held_keyframe_stays_however_its_time_is_rounded(start_s: float, is_bo
 @pytest.mark.parametrize("lag_s", [FOREVER_S, 6.0])
 def test_a_restart_leaves_what_the_batch_gives(monkeypatch, lag_s):
     """Just after a restart newest pose, landmarks and bias, and their joint covariance, are those of all factors."""
-    sizes = counted_solves(monkeypatch)
+    solved = counted(monkeypatch, batch_solution, "solve")
     size = next(n for n in range(5, 40) if len(in_the_basin(n, lag_s).given) >= FIRST_RESTART)
-    assert not sizes
+    assert not solved
     fed = in_the_basin(size, lag_s, stale_shift_m=1e-9)
-    assert sizes == [len(fed.given)]
+    assert [graph.size() for graph, _ in solved] == [len(fed.given)]
     keys = [X(size - 1), L(3), L(5), L(8), B(0)]
     batch = solve(graph_of(fed.given), fed.smoother.values)
     for key in keys[1:]:
@@ -282,9 +273,9 @@ def test_a_restart_leaves_what_the_batch_gives(monkeypatch, lag_s):
 
 
 def test_on_the_rail_restarts_change_nothing(monkeypatch):
-    sizes = counted_solves(monkeypatch)
+    solved = counted(monkeypatch, batch_solution, "solve")
     fed = on_the_rail(61, 3.1, stale_shift_m=1e-9)
-    assert len(sizes) >= 3
+    assert len(solved) >= 3
     assert_is_least_squares(fed, rail(61)[1], 61)
 
 
@@ -307,19 +298,19 @@ def test_drift_beyond_what_cholesky_takes_is_survived():
 
 @pytest.mark.parametrize(("shift_m", "is_due"), [(0.09, False), (0.11, True)])
 def test_the_window_restarts_once_a_landmark_has_moved_by_the_stale_shift(monkeypatch, shift_m, is_due):
-    sizes = counted_solves(monkeypatch)
+    solved = counted(monkeypatch, batch_solution, "solve")
     smoother = smoother_with(1e9, 1.0, 0.1)
     smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
     smoother.add([pose_prior(X(0), gtsam.Pose3(), 1e-6)] * FIRST_RESTART)
     smoother.add_landmark(L(1), np.zeros(3))
     smoother.add([point_prior(L(1), [shift_m, 0.0, 0.0], 0.01)])
     smoother.update(0.0)
-    assert bool(sizes) == is_due
+    assert bool(solved) == is_due
 
 
 def test_a_start_that_is_hardly_known_is_smoothed_to_the_end(monkeypatch):
     """100 m of doubt and millimetre odometry: Cholesky gives up, and the window stays with QR through its restarts."""
-    sizes = counted_solves(monkeypatch)
+    solved = counted(monkeypatch, batch_solution, "solve")
     calibration_ = Calibration(start=Start(position_sigma_m=(100.0,) * 3))
     fed = Fed(30.0, stale_shift_m=1e-9)
     fed.smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
@@ -335,5 +326,5 @@ def test_a_start_that_is_hardly_known_is_smoothed_to_the_end(monkeypatch):
         fed.add([factors.odometry(X(k - 1), X(k), motion)])
         fed.add(factors.landmark_sighting(X(k), L(1), SONAR, z, np.diag([4e-4, 8e-5]), plain, 0.3 if k == 1 else None))
         fed.smoother.update(float(k))
-    assert len(sizes) > 2
+    assert len(solved) > 2
     assert np.linalg.norm(fed.smoother.values.atPose3(X(99)).translation() - truth.translation()) < 0.05
