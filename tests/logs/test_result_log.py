@@ -239,25 +239,22 @@ def axes(marker: Any) -> Rotation:
     return Rotation.from_quat([q.x, q.y, q.z, q.w])
 
 
-def test_namespaces_tell_ellipsoids_that_mean_something_from_those_that_do_not(tmp_path: Path) -> None:
-    covariances = np.array([np.diag([0.01, 0.04, 0.09]), np.full((3, 3), np.nan)])
-    landmarks = LandmarkMap(np.array([7, 2**40]), np.array([[1.0, 2, 3], [4, 5, 6]]), covariances)
+def test_landmarks_are_drawn_as_ellipsoids_that_lie_as_their_covariances_where_known_below_their_identities(
+    tmp_path: Path,
+) -> None:
+    """A stick of 1 m standard deviation along (1, 1, 0), thin across; by hand, its longest axis lies there."""
+    along, across = np.array([1.0, 1, 0]) / np.sqrt(2), np.array([1.0, -1, 0]) / np.sqrt(2)
+    stick = np.outer(along, along) + 0.04 * np.outer(across, across) + 0.01 * np.diag([0, 0, 1.0])
+    positions, covariances = np.array([[1.0, 2, 3], [4, 5, 6]]), np.array([stick, np.full((3, 3), np.nan)])
+    landmarks = LandmarkMap(np.array([7, 2**40]), positions, covariances)
     (array,) = drawn(tmp_path, landmark_markers("/landmarks", landmarks, 1, GREY, 0.5))
     spaces, texts = [m.ns for m in array.markers], [m.text for m in array.markers]
     assert spaces == ["ellipsoid_95_percent", "covariance_unknown", "identity", "identity"]
     assert texts == ["", "", "7", "1099511627776"]
     assert [(m.pose.position.z, m.scale.z) for m in array.markers[2:]] == [(3.5, 0.5), (6.5, 0.5)]
     assert {(m.header.frame_id, m.action, m.lifetime.sec) for m in array.markers} == {("map", 0, 0)}
-
-
-def test_a_drawn_ellipsoid_lies_as_its_covariance_does(tmp_path: Path) -> None:
-    """A stick of 1 m standard deviation along (1, 1, 0), thin across; by hand, its longest axis lies there."""
-    along, across = np.array([1.0, 1, 0]) / np.sqrt(2), np.array([1.0, -1, 0]) / np.sqrt(2)
-    covariance = np.outer(along, along) + 0.04 * np.outer(across, across) + 0.01 * np.diag([0, 0, 1.0])
-    landmarks = LandmarkMap(np.array([1]), np.zeros((1, 3)), covariance[None])
-    marker = drawn(tmp_path, landmark_markers("/landmarks", landmarks, 1, GREY, 0.5))[0].markers[0]
-    diameters = xyz(marker.scale)
-    longest = axes(marker).as_matrix()[:, np.argmax(diameters)]
+    diameters = xyz(array.markers[0].scale)
+    longest = axes(array.markers[0]).as_matrix()[:, np.argmax(diameters)]
     np.testing.assert_allclose(np.abs(longest @ along), 1)
     np.testing.assert_allclose(np.sort(diameters), 2 * 2.7954834829151074 * np.array([0.1, 0.2, 1.0]))
 

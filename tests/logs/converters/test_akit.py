@@ -51,18 +51,14 @@ def test_axes_times_and_start_are_those_of_the_files(folder):
     assert np.allclose(sequence.calibration.start.position_m, sequence.truth.positions[1])
 
 
-@pytest.mark.parametrize(
-    ("roll", "pitch", "yaw", "body", "world"),
-    [
+def test_attitude_by_hand():
+    for roll, pitch, yaw, body, world in (
         (0, 0, 0, [1, 0, 0], [0, 1, 0]),  # north
         (0, 0, np.pi / 2, [0, 1, 0], [0, 1, 0]),  # heading east, left is north
         (0, np.pi / 2, 0, [1, 0, 0], [0, 0, 1]),  # nose up
         (np.pi / 2, 0, 0, [0, 1, 0], [0, 0, 1]),  # right side down, heading north: left is up
-    ],
-)
-def test_attitude_by_hand(roll, pitch, yaw, body, world):
-    turned = enu_R_flu(*np.array([[roll], [pitch], [yaw]])).apply(body)
-    assert np.allclose(turned, world, atol=1e-12)
+    ):
+        assert np.allclose(enu_R_flu(*np.array([[roll], [pitch], [yaw]])).apply(body), world, atol=1e-12)
 
 
 def test_earth_centred_reproduces_known_points():

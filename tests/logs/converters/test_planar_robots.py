@@ -69,19 +69,14 @@ def test_polar_covariance_is_the_numerical_jacobians(distance, azimuth, sx, sy, 
 # ---- axes and identities of DLR
 
 
-@pytest.fixture
-def dlr_of(tmp_path):
-    def sequence(*lines):
-        path = tmp_path / "map.circles"
-        path.write_text("# a header\n" + "\n".join(lines) + "\n")
-        return read_dlr(path)
-
-    return sequence
+def dlr(folder, *lines):
+    (folder / "map.circles").write_text("# a header\n" + "\n".join(lines) + "\n")
+    return read_dlr(folder)
 
 
-def test_ahead_is_minus_y_and_angles_grow_to_the_right_in_the_file(dlr_of):
+def test_ahead_is_minus_y_and_angles_grow_to_the_right_in_the_file(tmp_path):
     """By hand: forward variance is the file's c_yy, leftward its c_xx; the reflection leaves c_xy."""
-    s = dlr_of(STRAIGHT, "LANDMARK_C 0 -2 0.9 1e-3 2e-4 5e-3 4", f"{RIGHT} 2e-4", "LANDMARK_C 1 -2 1 1 0 1 4",
+    s = dlr(tmp_path, STRAIGHT, "LANDMARK_C 0 -2 0.9 1e-3 2e-4 5e-3 4", f"{RIGHT} 2e-4", "LANDMARK_C 1 -2 1 1 0 1 4",
                f"{RIGHT} 3e-4")  # fmt: skip
     poses = chain(hold_past_motions(s))
     assert np.allclose(poses[2], [[0, 1, 2], [-1, 0, 0], [0, 0, 1]], atol=1e-12)
@@ -97,9 +92,9 @@ def test_ahead_is_minus_y_and_angles_grow_to_the_right_in_the_file(dlr_of):
     assert s.detections.stamps_ns.tolist() == [10**9, 2 * 10**9]
 
 
-def test_several_identities_share_and_none_is_none(dlr_of):
+def test_several_identities_share_and_none_is_none(tmp_path):
     point = "LANDMARK_C 0 -2 0.9 1e-3 0 5e-3"
-    d = dlr_of(STRAIGHT, f"{point} 4 9", f"{point} -1", f"{point} 7").detections
+    d = dlr(tmp_path, STRAIGHT, f"{point} 4 9", f"{point} -1", f"{point} 7").detections
     assert d.candidate_ids.tolist() == [[4, 9], [-1, -1], [7, -1]]
     assert d.id_probability.tolist() == [[0.5, 0.5], [0, 0], [1, 0]]
 
