@@ -119,11 +119,11 @@ CASES: dict[str, Case] = {
         [("/depth", "std_msgs/msg/Float64", [{"data": float(i)} for i in range(3)])], f"[depth]\n{HEIGHT}",
         {"depth.z_m": [0, -1, -2], "depth.variance_m2": [NAN] * 3}, {"log.depth": None}),
     # reference poses
-    **{f"truth by its name, {'without' if covariance is None else 'with'} covariance": (
+    **{f"truth by its name, unknown covariance {covariance and covariance[0]}": (
         [poses(TURN, covariance)], "",
         {"truth.positions": [(1, 2, 3)] * 3, "truth.quaternions_xyzw": [TURN.as_quat()] * 3,
          "truth.covariances": np.full((3, 6, 6), NAN)}, {})
-       for covariance in (None, [0.0] * 36)},
+       for covariance in (None, [0.0] * 36, [-1.0] + [0.0] * 35)},
     **{f"odometry {chosen or 'by its name'}": (
         [poses(TURN, np.diag([4.0] * 3 + [1] * 3).ravel(), topic, "nav_msgs/msg/Odometry"), poses(TURN, topic="/pose")],
         chosen, {"truth.positions": [(1, 2, 3)] * 3, "truth.covariances": [np.diag([1] * 3 + [4] * 3)] * 3},
@@ -243,14 +243,6 @@ def test_a_covariance_for_ros_is_that_of_sampled_poses_in_fixed_axes() -> None:
     turns = np.array([gtsam.Rot3.Logmap(m.rotation().compose(pose.rotation().inverse())) for m in moved])
     sampled = np.cov(np.hstack([translations, turns]).T) * 1e8
     np.testing.assert_allclose(sampled, body_to_ros(covariances, rotations)[0], atol=0.05 * np.abs(sampled).max())
-
-
-def test_an_unknown_covariance_is_nan_here_and_zero_or_negative_there() -> None:
-    _, rotations = random_covariances(0, 2)
-    assert not body_to_ros(np.full((2, 6, 6), np.nan), rotations).any()
-    theirs = np.zeros((2, 6, 6))
-    theirs[1, 0, 0] = -1
-    assert np.isnan(ros_to_body(theirs, rotations)).all()
 
 
 @pytest.mark.parametrize(("entry", "toml", "message"), REFUSED.values(), ids=REFUSED)

@@ -31,12 +31,9 @@ def messages(store: Any, *, ros1: bool) -> list[tuple[str, str, Any]]:
         return header(seq=row, stamp=stamp, frame_id="imu") if ros1 else header(stamp=stamp, frame_id="imu")
 
     nine = np.arange(9.0)
-    found: list[tuple[str, str, Any]] = []
-    for row in range(5):
-        imu = types["sensor_msgs/msg/Imu"](
-            head(row), quaternion(0, 0, 0, 1), nine, vector(row, 2, 3), nine, vector(0, 0, 9.8), nine
-        )
-        found.append(("/imu", "sensor_msgs/msg/Imu", imu))
+    imu, fixed = "sensor_msgs/msg/Imu", (nine, vector(0, 0, 9.8), nine)
+    rows = [types[imu](head(row), quaternion(0, 0, 0, 1), nine, vector(row, 2, 3), *fixed) for row in range(5)]
+    found = [("/imu", imu, row) for row in rows]
     move = types["geometry_msgs/msg/Transform"](vector(1, 2, 3), quaternion(0, 0, 0, 1))
     link = types["geometry_msgs/msg/TransformStamped"](head(0), "imu", move)
     found.append(("/tf_static", "tf2_msgs/msg/TFMessage", types["tf2_msgs/msg/TFMessage"]([link])))
