@@ -88,7 +88,7 @@ def assert_is_least_squares(fed: Fed, numbers: Rail, nodes: int, landmarks: tupl
 
 
 def in_the_basin(
-    steps: int, lag_s: float, stale_shift_m: float = NEVER_M, seed: int = 0, bias_steps: int = 1000
+    steps: int, lag_s: float, stale_shift_m: float = NEVER_M, seed: int = 0, bias_steps: int = 1000, kernel=plain
 ) -> Fed:
     """Circles past three landmarks with a gyro bias that walks between stretches; nothing about it is linear."""
     rng = np.random.default_rng(seed)
@@ -115,7 +115,7 @@ def in_the_basin(
             if i not in seen:
                 fed.smoother.add_landmark(L(i), p + 0.3 * rng.standard_normal(3))
             new = factors.landmark_sighting(
-                X(k), L(i), SONAR, z, np.diag([4e-4, 8e-5]), plain, None if i in seen else 0.3
+                X(k), L(i), SONAR, z, np.diag([4e-4, 8e-5]), kernel, None if i in seen else 0.3
             )
             fed.add(new)
             seen.add(i)

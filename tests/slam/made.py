@@ -18,6 +18,13 @@ from sonar_graph.slam import Isam2, Isam2Params
 from sonar_graph.slam.smoother import Smoother, SmootherParams
 from sonar_graph.states import Estimate
 
+POSES = {
+    "random": gtsam.Pose3(gtsam.Rot3.RzRyRx(0.4, -0.6, 2.2), np.array([3.0, -2.0, 1.0])),
+    "near identity": gtsam.Pose3(gtsam.Rot3.RzRyRx(1e-9, -1e-9, 1e-9), np.array([1e-9, 0.0, 0.0])),
+    "yaw near pi": gtsam.Pose3(gtsam.Rot3.RzRyRx(0.05, 0.02, np.pi - 1e-8), np.array([-1.0, 5.0, 0.3])),
+    "yaw beyond -pi": gtsam.Pose3(gtsam.Rot3.RzRyRx(0.0, 0.0, -np.pi + 1e-8), np.array([-1.0, 5.0, 0.3])),
+}
+
 
 def isam2_params(**given: Any) -> Isam2Params:
     """By dotted names, with two underscores for a dot: ``smoother__lag_s``."""
@@ -56,6 +63,16 @@ def values_of(**named: Any) -> gtsam.Values:
     for name, value in named.items():
         values.insert(symbols[name[0]](int(name[1:])), value)
     return values
+
+
+def scattered(values: gtsam.Values, rng: np.random.Generator, sigmas: dict[str, float]) -> gtsam.Values:
+    """Every variable moved, by sigmas of its kind: x, l, b."""
+    off = values.zeroVectors()
+    for key in list(values.keys()):
+        moved = gtsam.VectorValues()
+        moved.insert(key, sigmas[chr(gtsam.Symbol(key).chr())] * rng.standard_normal(len(off.at(key))))
+        off.update(moved)
+    return values.retract(off)
 
 
 def graph_of(factors: Iterable[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorGraph:

@@ -21,16 +21,10 @@ from sonar_graph.slam.models.sonar_model import range_azimuth
 from sonar_graph.testing import check_jacobians
 
 from .graphs import information
-from .made import graph_of, huber, plain, random_covariance, some_motion, values_of
+from .made import POSES, graph_of, huber, plain, random_covariance, some_motion, values_of
 
 BODY_T_SONAR = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, 0.5, -0.2), np.array([0.4, 0.05, -0.1]))
-BODY_POSES = {
-    "random": gtsam.Pose3(gtsam.Rot3.RzRyRx(0.4, -0.6, 2.2), np.array([3.0, -2.0, 1.0])),
-    "near identity": gtsam.Pose3(gtsam.Rot3.RzRyRx(1e-9, -1e-9, 1e-9), np.array([1e-9, 0.0, 0.0])),
-    "yaw near pi": gtsam.Pose3(gtsam.Rot3.RzRyRx(0.05, 0.02, np.pi - 1e-8), np.array([-1.0, 5.0, 0.3])),
-    "yaw beyond -pi": gtsam.Pose3(gtsam.Rot3.RzRyRx(0.0, 0.0, -np.pi + 1e-8), np.array([-1.0, 5.0, 0.3])),
-}
-poses = pytest.mark.parametrize("pose", BODY_POSES.values(), ids=BODY_POSES)
+poses = pytest.mark.parametrize("pose", POSES.values(), ids=POSES)
 SIGMA = np.array([0.02, 0.009])
 """Noise of range and azimuth."""
 PLANE = PlanarMotion(z_m=0.4, z_sigma_m=0.01, tilt_sigma_rad=0.02)
@@ -98,7 +92,7 @@ def test_derivatives_are_those_of_differences(
 
 def test_odometry_error_is_what_the_pose_is_off_the_corrected_motion():
     """Zero where the second pose is the first moved by the corrected motion; else the perturbation from there."""
-    motion, pose, bias = some_motion(2, 0.05), BODY_POSES["random"], np.array([0.02, 0.0, -0.03])
+    motion, pose, bias = some_motion(2, 0.05), POSES["random"], np.array([0.02, 0.0, -0.03])
     perturbation = np.array([0.01, -0.02, 0.03, 0.1, 0.2, -0.3])
     X_j = pose.compose(motion.i_T_j).compose(gtsam.Pose3.Expmap(motion.D_bias @ (bias - motion.bias)))
     factor = factors.odometry_with_bias(X(0), X(1), B(0), motion)
@@ -111,7 +105,7 @@ def test_odometry_error_is_what_the_pose_is_off_the_corrected_motion():
 @pytest.mark.parametrize("sigma", [0.05, 1e-5, 1e-7])
 def test_odometry_keeps_the_correlations_of_the_shortest_motion(sigma: float):
     """GTSAM's own choice drops them where all are below 1e-9."""
-    motion, pose = replace(some_motion(3), covariance=random_covariance(6, sigma)), BODY_POSES["random"]
+    motion, pose = replace(some_motion(3), covariance=random_covariance(6, sigma)), POSES["random"]
     off = sigma * np.array([0.3, -0.2, 0.1, 1.0, 2.0, -1.0])
     values = values_of(X0=pose, X1=pose.compose(motion.i_T_j).compose(gtsam.Pose3.Expmap(off)), B0=motion.bias)
     expected = 0.5 * off @ np.linalg.solve(motion.covariance, off)
@@ -146,7 +140,7 @@ def test_a_sighting_is_range_and_azimuth_whatever_the_elevation(pose, azimuth, e
 @settings(max_examples=20)
 def test_an_azimuth_is_an_angle_however_wrong_it_is(azimuth, off):
     """Ahead of the sonar and at elevation 0, a gross error weighs as the model says, not as its tangent."""
-    pose = BODY_POSES["random"]
+    pose = POSES["random"]
     values = values_of(X0=pose, L0=seen_from(pose, azimuth, 0.0, 2.0))
     z, cov = np.array([2.0, azimuth - off]), np.diag([4e-4, 8e-5])
     camera = factors.landmark_sighting(X(0), L(0), BODY_T_SONAR, z, cov, plain)[0]
@@ -157,7 +151,7 @@ def test_an_azimuth_is_an_angle_however_wrong_it_is(azimuth, off):
 @given(st.floats(-1.13, 1.13), st.floats(-0.12, 0.12), st.floats(-0.9, 0.9))
 @settings(max_examples=20)
 def test_a_correlated_sighting_is_the_model_weighed_by_its_covariance(azimuth, elevation, correlation):
-    pose, off, cov = BODY_POSES["random"], np.array([0.03, -0.01]), correlated(correlation)
+    pose, off, cov = POSES["random"], np.array([0.03, -0.01]), correlated(correlation)
     z = np.array([2.0, azimuth]) - off
     values = values_of(X0=pose, L0=seen_from(pose, azimuth, elevation, 2.0))
     sighting = factors.correlated_sighting(X(0), L(0), BODY_T_SONAR, z, cov, plain)
@@ -167,7 +161,7 @@ def test_a_correlated_sighting_is_the_model_weighed_by_its_covariance(azimuth, e
 
 def test_without_an_elevation_a_sighting_says_next_to_nothing_about_it():
     """Information along the unmeasured direction is under a millionth of that across it; with a sigma, it is said."""
-    pose = BODY_POSES["random"]
+    pose = POSES["random"]
     point = seen_from(pose, 0.2, 0.05, 2.0)
     upwards = seen_from(pose, 0.2, 0.05 + 1e-6, 2.0) - point
     upwards /= np.linalg.norm(upwards)
@@ -305,7 +299,7 @@ def joint_motion(seed: int, rule: str = "inertial") -> JointMotion:
 
 
 def fitting(
-    motion: JointMotion, seed: int, off: float, turned: bool = False, X_i: gtsam.Pose3 = BODY_POSES["random"]
+    motion: JointMotion, seed: int, off: float, turned: bool = False, X_i: gtsam.Pose3 = POSES["random"]
 ) -> gtsam.Values:
     """States that obey the motion up to random errors of this size; turned: an attitude off by nearly half a turn."""
     rng = np.random.default_rng(seed)

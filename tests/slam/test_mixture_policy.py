@@ -21,7 +21,7 @@ from sonar_graph.states import DetectionJournal, Outcome
 from . import dive as dive_module
 from .dive import CALIBRATION, FLOOR, T0_NS, Dive, spherical
 from .graphs import gtsams_solution
-from .made import plain, smoother_with, values_of
+from .made import plain, scattered, smoother_with, values_of
 
 PLACES = {7: np.array([2.6, 0.5, -1.0]), 4: np.array([2.9, 1.4, -1.0]), 9: np.array([3.2, 0.1, -1.0])}
 """Of landmarks, in the world of `Dive`: on the floor, within its sonar's fan."""
@@ -122,15 +122,10 @@ def largest(named: int, components: dict[int, list], sighting) -> gtsam.CustomFa
 def test_the_end_is_a_fixed_point_of_the_max_mixture_that_another_solver_finds() -> None:
     world, truth = misnamed("max-mixture")
     values = world.sightings.history().values
-    rng, off = np.random.default_rng(1), values.zeroVectors()
-    for key in list(values.keys()):
-        moved = gtsam.VectorValues()
-        moved.insert(key, 3e-3 * rng.standard_normal(len(off.at(key))))
-        off.update(moved)
-    scattered = values.retract(off)
-    found = gtsams_solution(max_mixture(world), scattered)
+    start = scattered(values, np.random.default_rng(1), {"x": 3e-3, "l": 3e-3})
+    found = gtsams_solution(max_mixture(world), start)
     for i in PLACES:
-        assert np.linalg.norm(scattered.atPoint3(L(i)) - values.atPoint3(L(i))) > 1e-3
+        assert np.linalg.norm(start.atPoint3(L(i)) - values.atPoint3(L(i))) > 1e-3
         np.testing.assert_allclose(found.atPoint3(L(i)), values.atPoint3(L(i)), atol=1e-5)
     log = world.sightings.log()
     assert log.landmark_ids.tolist() == truth
@@ -145,11 +140,10 @@ def test_wrong_names_cost_nothing_and_believing_them_does(kernel: Kernel) -> Non
 
 
 def test_right_names_give_the_graph_of_one_that_believes_them() -> None:
-    doubted, believed = misnamed("max-mixture", share=0.0)[0], misnamed("robust", share=0.0)[0]
-    assert doubted.outcomes == believed.outcomes
+    worlds = [misnamed(policy, share=0.0)[0] for policy in ("max-mixture", "robust")]
+    assert worlds[0].outcomes == worlds[1].outcomes
     for i in PLACES:
-        places = [world.sightings.history().values.atPoint3(L(i)) for world in (doubted, believed)]
-        np.testing.assert_allclose(*places, atol=1e-3)
+        np.testing.assert_allclose(*(w.sightings.history().values.atPoint3(L(i)) for w in worlds), atol=1e-3)
 
 
 @pytest.mark.parametrize("can_move", [True, False])

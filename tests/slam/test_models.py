@@ -27,7 +27,7 @@ from sonar_graph.slam.models.sonar_model import (
 from sonar_graph.slam.smoother.batch_solution import JointCovariance
 
 from .graphs import block_of
-from .made import polar, random_covariance, some_motion
+from .made import POSES, polar, random_covariance, some_motion
 
 STEP = 1e-6
 TOLERANCE = 1e-7
@@ -120,12 +120,7 @@ def test_a_floor_outside_the_aperture_gives_no_elevation(floor_z):
 
 
 BODY_T_SONAR = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, 0.4, -0.3), np.array([0.4, 0.1, -0.2]))
-KEYFRAMES = {
-    "random": gtsam.Pose3(gtsam.Rot3.RzRyRx(0.3, -0.4, 2.2), np.array([3.0, -2.0, 1.0])),
-    "near identity": gtsam.Pose3(gtsam.Rot3.RzRyRx(1e-9, 0.0, -1e-9), np.array([1e-9, 0.0, 0.0])),
-    "yaw at pi": gtsam.Pose3(gtsam.Rot3.RzRyRx(0.0, 0.1, np.pi), np.array([-1.0, 5.0, 0.3])),
-}
-keyframes = pytest.mark.parametrize("keyframe", KEYFRAMES.values(), ids=KEYFRAMES)
+keyframes = pytest.mark.parametrize("keyframe", POSES.values(), ids=POSES)
 with_bias = pytest.mark.parametrize("bias", [True, False], ids=["bias", "no bias"])
 
 
@@ -255,7 +250,7 @@ SMALL = 1e-3
 @pytest.mark.parametrize("seen_from", [X(1), X(2)], ids=["an earlier keyframe", "the same keyframe"])
 def test_the_joint_covariance_is_that_of_many_draws(seen_from: int):
     """Keyframes, bias, landmark, motion and the located point's own noise, drawn with their correlations."""
-    keyframe, motion = KEYFRAMES["random"], some_motion(3, SMALL)
+    keyframe, motion = POSES["random"], some_motion(3, SMALL)
     earlier = keyframe.compose(gtsam.Pose3(gtsam.Rot3.Yaw(0.2), np.array([-0.4, 0.2, 0.0])))
     landmark, located = ahead(keyframe, motion), ahead(keyframe, motion, -0.4)
     joint = joint_of(random_covariance(18, SMALL, 5), {X(1): 6, X(2): 6, B(0): 3, L(5): 3})
@@ -283,7 +278,7 @@ def test_the_joint_covariance_is_that_of_many_draws(seen_from: int):
 @pytest.mark.parametrize("left_out", ["pose with landmark", "pose with bias", "bias with landmark", "motion"])
 def test_no_part_of_the_covariance_is_idle(left_out):
     """Negative control: each cross-covariance, and the motion's noise, changes what is expected."""
-    view, motion, landmarks, joint = some_view(KEYFRAMES["random"], True)
+    view, motion, landmarks, joint = some_view(POSES["random"], True)
     S = expected_of(view, landmarks, 5)[1][0]
     pairs = {"pose with landmark": (X(2), L(5)), "pose with bias": (X(2), B(0)), "bias with landmark": (B(0), L(5))}
     if left_out == "motion":
@@ -291,5 +286,5 @@ def test_no_part_of_the_covariance_is_idle(left_out):
     else:
         a, b = pairs[left_out]
         joint.at(a, b)[:] = joint.at(b, a)[:] = 0.0
-    without = expected_of(made(KEYFRAMES["random"], motion, joint), landmarks, 5)[1][0]
+    without = expected_of(made(POSES["random"], motion, joint), landmarks, 5)[1][0]
     assert np.abs(S - without).max() > 0.02 * np.abs(S).max()

@@ -42,7 +42,6 @@ def sighting_of(landmark_id: int, k: int, floor: FloorPrior | None, landmarks: L
 
 
 def errors(graph: gtsam.NonlinearFactorGraph, ids: list[int], landmarks: LandmarkSightings) -> list[float]:
-    """Of a graph at some estimates."""
     rng, found = np.random.default_rng(0), []
     for _ in range(4):
         values = gtsam.Values()

@@ -152,6 +152,7 @@ USED_LATER, FORGOTTEN, TAKEN_BACK = Outcome.USED_LATER, Outcome.FORGOTTEN, Outco
 NONE, DOUBTFUL = [0.0] * 4, [0.1, 0.6, 0.1, 0.1]
 TOLD = {
     "too late": (2.0, [(0.0, FLAT), (1.0, FLAT), (2.5, FLAT)], [FORGOTTEN, WAITING, WAITING]),
+    "too late without another frame": (2.0, [(0.0, FLAT), (5.0, None)], [FORGOTTEN]),
     "the rest in time": (2.0, [(0.9, FLAT), (1.0, FLAT), (3.0, SURE[5])], [FORGOTTEN, USED_LATER, USED]),
     "taken back, and too late for another landmark": (
         2.0, [(0.0, SURE[5]), (1.0, FLAT), (1.5, NONE), (2.6, SURE[5])], [TAKEN_BACK, USED_LATER, USED_LATER, USED],
@@ -166,7 +167,10 @@ TOLD = {
 def test_a_track_waits_for_an_identity_no_longer_than_asked(longest_wait_s, seen, outcomes):
     dive = Dive(identity=TRUSTING.model_copy(update={"longest_wait_s": longest_wait_s}))
     for after_s, belief in seen:
-        see(dive, after_s, belief)
+        if belief:
+            see(dive, after_s, belief)
+    dive.keyframes.advance(T0_NS + round(seen[-1][0] * NS))
+    dive.sightings.forget()
     assert dive.outcomes == outcomes
 
 
@@ -192,15 +196,6 @@ def test_what_was_refused_for_one_landmark_is_not_refused_for_good():
     assert dive.outcomes == [TAKEN_BACK] * 3 + [WAITING] * 2
     see(dive, 1.0, SURE[6])
     assert dive.outcomes[:5] == [Outcome.MOVED] * 3 + [USED_LATER] * 2
-
-
-def test_what_waits_too_long_is_forgotten_without_another_frame():
-    dive = Dive(identity=TRUSTING.model_copy(update={"longest_wait_s": 2.0}))
-    see(dive, 0.0, FLAT)
-    dive.keyframes.advance(T0_NS + 5 * NS)
-    dive.sightings.forget()
-    assert dive.outcomes == [FORGOTTEN]
-    assert not dive.sightings.ids
 
 
 def test_of_tracks_that_claim_a_landmark_at_once_the_more_probable_gets_the_earlier_frames():
