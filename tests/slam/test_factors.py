@@ -41,9 +41,6 @@ def seen_from(pose: gtsam.Pose3, azimuth_rad: float, elevation_rad: float, range
     return pose.transformFrom(BODY_T_SONAR.transformFrom(beam))
 
 
-# Derivatives ------------------------------------------------------------------------------------------------------
-
-
 def odometries(pose: gtsam.Pose3, rng: np.random.Generator) -> Made:
     for spread in (0.0, 1.0):
         motion, bias = some_motion(int(rng.integers(99)), 0.05), spread * 0.1 * rng.standard_normal(3)

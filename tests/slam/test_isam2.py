@@ -160,8 +160,7 @@ def test_twenty_basins_are_consistent():
 
 def test_time_does_not_go_back(basin):
     """The same instant again is the same estimate and one row of the trajectory; an earlier one gets none."""
-    estimator = Isam2(basin.calibration)
-    instants = basin.instants(1.0)[:20]
+    estimator, instants = Isam2(basin.calibration), basin.instants(1.0)[:20]
     first = [estimator.process(m) for m in basin.replay(instants)][-1]
     again = estimator.process(Measurements(int(instants[-1])))
     assert again.world_T_body.equals(first.world_T_body, 1e-12)
@@ -277,8 +276,6 @@ def test_answers_that_differ_in_one_bit_are_unlike() -> None:
     del other.estimates[-1]
     assert "causal estimates" in unlike(one, other)
 
-
-# Settings ------------------------------------------------------------------------------------------------------------
 
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "gate without its policy": (

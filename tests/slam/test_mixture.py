@@ -187,9 +187,6 @@ def test_a_landmark_that_one_watch_has_put_where_it_is_has_no_place_for_it(is_al
     assert [list(row) for row in found] == [[4, 7, None]] * 3
 
 
-# Choices ------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("seed", range(8))
 def test_the_best_choices_are_the_most_probable_of_all(seed: int) -> None:
     """Five watches of three landmarks or of something else, half of them misnamed, two of them in the same frames."""

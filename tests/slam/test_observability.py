@@ -161,8 +161,6 @@ def test_noise_that_is_no_covariance_is_refused_where_gtsam_takes_it(cov):
         factors.gaussian(cov)
 
 
-# Systems without a solution -----------------------------------------------------------------------------------------
-
 STEP = gtsam.Pose3(gtsam.Rot3.Rz(0.1), np.array([1.0, 0.0, 0.0]))
 SIGMAS = gtsam.noiseModel.Diagonal.Sigmas(np.array([0.01] * 3 + [0.05] * 3))
 

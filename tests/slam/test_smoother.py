@@ -12,16 +12,7 @@ from sonar_graph.slam.smoother.batch_solution import solve
 from sonar_graph.slam.smoother.factor_store import GraphEdit
 from sonar_graph.slam.smoother.incremental import FIRST_RESTART
 
-from .fed import (
-    FOREVER_S,
-    NEVER_M,
-    SONAR,
-    Fed,
-    assert_is_least_squares,
-    in_the_basin,
-    on_the_rail,
-    ranged,
-)
+from .fed import FOREVER_S, NEVER_M, SONAR, Fed, assert_is_least_squares, in_the_basin, on_the_rail, ranged
 from .graphs import block_of, off_sigmas
 from .made import counted, graph_of, isotropic, motion_of, plain, point_prior, polar, pose_prior, smoother_with
 from .rail import STEP_S, Rail, rail

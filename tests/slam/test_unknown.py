@@ -247,7 +247,7 @@ def shared(count: int, common_sigma: float, own_sigma: float) -> np.ndarray:
     return common_sigma**2 * np.kron(np.ones((count, count)), np.eye(3)) + own_sigma**2 * np.eye(3 * count)
 
 
-APART = {5: [1], 7: [2], 9: [3]}
+APART, TOGETHER = {5: [1], 7: [2]}, {5: [0.0] * 3, 7: [0.0] * 3}
 
 
 def assert_gate(sigma_m: float, own_sigma: float, common_sigma: float, named: list[int], **how) -> None:
@@ -272,18 +272,16 @@ def test_the_noise_of_two_sightings_is_the_larger_one_and_across_the_beam_where_
 
 
 def test_two_of_one_frame_stay_two():
-    points, cov = {5: [0.0] * 3, 7: [0.0] * 3}, shared(2, 1.0, 0.05)
-    assert nearest(points, cov, [], {5: [1, 2], 7: [2, 3]}) is None
-    assert nearest(points, cov, [], {5: [1, 2], 7: [3, 4]}) == (5, 7)
+    for frames, merged in (([2, 3], None), ([3, 4], (5, 7))):
+        assert nearest(TOGETHER, shared(2, 1.0, 0.05), [], {5: [1, 2], 7: frames}) == merged
 
 
 @pytest.mark.parametrize("own_sigma", [0.1, 1.0])
 def test_a_wide_difference_says_nothing(own_sigma: float):
     """Compatible with zero, but no denser there, horizontally, than other landmarks are."""
     density = 1 / (2 * math.pi * (2 * own_sigma**2 + NOISE_M**2))
-    points, cov = {5: [0.0] * 3, 7: [0.0] * 3}, shared(2, 1.0, own_sigma)
-    assert nearest(points, cov, [], APART, math.log(0.99 * density)) == (5, 7)
-    assert nearest(points, cov, [], APART, math.log(1.01 * density)) is None
+    for share, merged in ((0.99, (5, 7)), (1.01, None)):
+        assert nearest(TOGETHER, shared(2, 1.0, own_sigma), [], APART, math.log(share * density)) == merged
 
 
 def test_without_merging_they_stay_two(monkeypatch: pytest.MonkeyPatch):
