@@ -134,13 +134,8 @@ def load_estimator(name: str) -> type[Estimator]:
 def make_params(estimator: type[Estimator], overrides: dict[str, Any], name: str) -> Section:
     """An estimator's settings with some replaced.
 
-    Parameters
-    ----------
-    overrides
-        Values by name; of a setting in a section by its dotted name, ``{"identity.policy": "gate"}``, or nested,
-        ``{"identity": {"policy": "gate"}}``.
-
-    Raises `EstimatorError` naming the setting that does not exist or does not fit, and those that exist.
+    ``overrides``: values by name; of a setting in a section by its dotted name, ``{"identity.policy": "gate"}``, or
+    nested, ``{"identity": {"policy": "gate"}}``. Raises `EstimatorError` naming the setting that does not exist or does not fit, and those that exist.
     """
     try:
         return estimator.Params.model_validate(nested(overrides))

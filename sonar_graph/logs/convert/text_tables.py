@@ -32,16 +32,8 @@ def read_table(
 ) -> NumberTable:
     """Read a table whose every field is a finite number.
 
-    Parameters
-    ----------
-    path
-        Text file; blank lines and lines that begin with ``#`` are skipped.
-    columns
-        Names of the columns, for the error and for their number.
-    delimiter
-        None: white space.
-    header_lines
-        Number of lines at the top without data.
+    Blank lines and lines that begin with ``#`` are skipped, and so many ``header_lines``; ``columns`` are for the error
+    and for their number; ``delimiter``: None is white space.
 
     Raises `DatasetError` when the file is missing, has no row, or a row does not hold as many numbers as there are
     columns.

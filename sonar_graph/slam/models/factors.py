@@ -109,7 +109,10 @@ def gaussian(cov: Floats) -> gtsam.noiseModel.Base:
     motion over a short time would lose all its correlations. A matrix that is none it takes as well, and weighs by
     numbers that are none.
 
-    Raises `MeasurementError` when the matrix is not positive definite.
+    Raises
+    ------
+    MeasurementError
+        When the matrix is not positive definite.
     """
     try:
         np.linalg.cholesky(cov)
@@ -198,10 +201,15 @@ def landmark_sighting(
 ) -> list[gtsam.NoiseModelFactor]:
     """Range and azimuth of a landmark.
 
-    ``body_T_sonar``: sonar in the keyframe's body frame when the frame was taken; ``z``, ``cov``: range (m) and azimuth
-    (rad), shape (2,), and their covariance, shape (2, 2); ``elevation_sigma_rad``: elevation is N(0, sigma²); None: not
-    said here. Say it once a landmark: its elevation does not vary between frames as noise would, so that repeating it
-    would invent information.
+    Parameters
+    ----------
+    body_T_sonar
+        Sonar in the keyframe's body frame when the frame was taken.
+    z, cov
+        Range (m) and azimuth (rad), shape (2,), and their covariance, shape (2, 2).
+    elevation_sigma_rad
+        Elevation is N(0, sigma²); None: not said here. Say it once a landmark: its elevation does not vary between
+        frames as noise would, so that repeating it would invent information.
     """
     range_var, azimuth_var, covariance = float(cov[0, 0]), float(cov[1, 1]), float(cov[0, 1])
     factors: list[gtsam.NoiseModelFactor] = [
@@ -270,7 +278,10 @@ def first_direction(pose_key: int, landmark_key: int, body_p_landmark: Floats) -
     identity contradicts a right one a solution may lie behind both: without this factor nothing but two ranges would
     then hold the landmark, and the system would have no solution.
 
-    ``body_p_landmark``: in the keyframe's body frame, shape (3,), m.
+    Parameters
+    ----------
+    body_p_landmark
+        In the keyframe's body frame, shape (3,), m.
     """
     range_m = float(np.linalg.norm(body_p_landmark))
     noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([1.0, 1.0, range_m]))

@@ -71,8 +71,11 @@ def inertial_doppler_odometry(
     scale, mounting
         Keys; None: as calibrated.
 
-    Raises `MeasurementError` when gravity is no vector, a key is given twice or is no integer, or the motion's specific
-    force was not measured.
+    Raises
+    ------
+    MeasurementError
+        When gravity is no vector, a key is given twice or is no integer, or the motion's specific force was not
+        measured.
     """
     keys = [pose_i, velocity_i, pose_j, velocity_j, bias]
     columns = [POSE_I, VELOCITY_I, POSE_J, VELOCITY_J, BIAS]
