@@ -135,7 +135,8 @@ def make_params(estimator: type[Estimator], overrides: dict[str, Any], name: str
     """An estimator's settings with some replaced.
 
     ``overrides``: values by name; of a setting in a section by its dotted name, ``{"identity.policy": "gate"}``, or
-    nested, ``{"identity": {"policy": "gate"}}``. Raises `EstimatorError` naming the setting that does not exist or does not fit, and those that exist.
+    nested, ``{"identity": {"policy": "gate"}}``. Raises `EstimatorError` naming the setting that does not exist or does
+    not fit, and those that exist.
     """
     try:
         return estimator.Params.model_validate(nested(overrides))

@@ -68,7 +68,8 @@ def run(
 ) -> EstimatorRun:
     """Run a fresh estimator over a sequence, cut at the instants, and ask for all results at the end.
 
-    ``ask_every``: also ask twice after every so many steps, and again at the end; 0: only at the end. Raises `ContractError` when the answers to one question, asked twice, differ.
+    ``ask_every``: also ask twice after every so many steps, and again at the end; 0: only at the end.
+    Raises `ContractError` when the answers to one question, asked twice, differ.
     """
     estimator = make(sequence.calibration)
     estimates: list[Estimate] = []
