@@ -249,6 +249,9 @@ ISOTROPIC = {"velocity_sigma_m_s": (0.01, 0.01, 0.01)}
 @pytest.mark.parametrize(
     ("way", "column", "sensors", "measured", "tolerance"),
     [
+        (WAYS["linear"], "rate", ONE_PLACE, {"lever": np.zeros(3)}, 0.03),
+        (WAYS["linear"], "velocity", {}, {}, 0.1),  # of few rows, the ends as if whole: 1 / (2 n) too large
+        (WAYS["held"], "velocity", {}, {}, 0.002),
         # IMU and Doppler log in one place: how noise of single rates acts on the lever between them is left out.
         (WAYS["closed gap"], "rate", ONE_PLACE, {"lever": np.zeros(3)}, 0.02),
         (WAYS["open gap"], "rate", ONE_PLACE, {"lever": np.zeros(3), "dvl_hz": 10.0}, 0.15),
