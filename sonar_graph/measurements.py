@@ -288,7 +288,7 @@ class LandmarkDetections(Block):
         return self.candidate_ids[row, best], self.id_probability[row, best]
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False)
 class SonarFrames:
     """Polar images of an imaging sonar, as recorded; frames of one block share their beams and range bins.
 

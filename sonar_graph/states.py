@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import reprlib
 from array import array
 from collections import Counter
 from copy import deepcopy
@@ -158,7 +159,7 @@ class LandmarkMap:
         return len(self.ids)
 
     def __repr__(self) -> str:
-        return f"LandmarkMap({self.ids.tolist()}, positions {self.positions.round(3).tolist()})"
+        return f"LandmarkMap({len(self)} landmarks, ids {reprlib.repr(self.ids.tolist())})"
 
 
 class Outcome(StrEnum):

@@ -42,7 +42,7 @@ def test_results_say_themselves_in_a_line():
     assert [repr(each) for each in (turning(), Trajectory.from_estimates([]), two, log)] == [
         "Trajectory(11 poses, 0 to 10000000000 ns)",
         "Trajectory(0 poses)",
-        "LandmarkMap([1, 7], positions [[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]])",
+        "LandmarkMap(2 landmarks, ids [1, 7])",
         "DetectionLog(3 USED)",
     ]
 

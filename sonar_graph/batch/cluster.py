@@ -46,7 +46,7 @@ def run_batch(runs: Iterable[PlannedRun], store: Store, limits: Limits, where: W
     """Do runs and keep each as soon as it is done; ``progress`` is called after that.
 
     Raises `BatchError` when there is no scheduler or no worker, workers cannot do any run, or nothing can be written.
-    Runs that are done by then are kept; `KeyboardInterrupt` on Ctrl-C, after a few seconds in which workers are ended.
+    Runs that are done by then are kept. Raises `KeyboardInterrupt` on Ctrl-C, when the workers have ended.
     """
     planned = list(runs)
     if not planned:

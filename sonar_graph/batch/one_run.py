@@ -73,8 +73,8 @@ def perform(run: PlannedRun, folder: Path) -> Row:
 
     Returns scores, times and versions. A log that cannot be read and an estimator that fails are rows with a reason.
     Raises `BatchError` when this process has other versions or another source than those that the run was planned with,
-    before the estimator is loaded or after the run, or when its files have another content; `OSError` when the folder
-    cannot be written; that is no result.
+    before the estimator is loaded or after the run, or when its files have another content, and `OSError` when the
+    folder cannot be written; neither is a result.
     """
     here = versions_of(run.estimator)
     if differing := _differing(here, run.versions):

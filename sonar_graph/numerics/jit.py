@@ -1,6 +1,7 @@
 """Compilation of loops over samples and pixels to machine code, with a cache that follows changed callees."""
 
 import logging
+import threading
 import time
 from collections.abc import Iterable
 from pathlib import Path
@@ -72,21 +73,20 @@ class _Notice(event.Listener):
 event.register("numba:compile", _Notice())  # type: ignore[no-untyped-call]  # numba has no types
 
 
-class _Stopwatch(event.Listener):
-    """Seconds in which numba compiles, or loads what it has compiled, in this process."""
+class _Stopwatch(event.Listener, threading.local):
+    """Seconds in which a thread compiles, loads what was compiled, or waits for another that does."""
 
-    def __init__(self) -> None:
-        self.total_s, self._depth, self._began_s = 0.0, 0, 0.0
+    depth, began_s, total_s = 0, 0.0, 0.0
 
     def on_start(self, _event: Any) -> None:
-        if not self._depth:
-            self._began_s = time.perf_counter()
-        self._depth += 1
+        if not self.depth:
+            self.began_s = time.perf_counter()
+        self.depth += 1
 
     def on_end(self, _event: Any) -> None:
-        self._depth -= 1
-        if not self._depth:
-            self.total_s += time.perf_counter() - self._began_s
+        self.depth -= 1
+        if not self.depth:
+            self.total_s += time.perf_counter() - self.began_s
 
 
 _STOPWATCH = _Stopwatch()
@@ -94,5 +94,5 @@ event.register("numba:compiler_lock", _STOPWATCH)  # type: ignore[no-untyped-cal
 
 
 def compiling_s() -> float:
-    """Seconds that this process has spent compiling and loading compiled code until now."""
+    """Seconds that this thread has spent compiling and loading compiled code until now."""
     return _STOPWATCH.total_s

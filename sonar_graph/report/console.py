@@ -90,7 +90,7 @@ def _lines_below(comparison: Comparison, metric: str | None) -> list[str]:
         if is_odometry and score is not None and score.value > FAR_FROM_FITTING:
             # odometry alone contradicts the reference: no estimator is to blame
             known = comparison.sequence.notes.get("truth")
-            return [*lines, ASK_INSPECT.format(f" ({known})" if known else "")]
+            return [*lines, ASK_INSPECT.format(f" (the log says: {known})" if known else "")]
     return lines
 
 

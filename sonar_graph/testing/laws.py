@@ -17,6 +17,7 @@ data nor simulator.
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -104,13 +105,13 @@ def unlike(one: EstimatorRun, other: EstimatorRun) -> list[str]:
     return [name for name, (mine, theirs) in parts.items() if not _is_same(mine, theirs)]
 
 
-def _is_same(mine: object, theirs: object) -> bool:
+def _is_same(mine: Any, theirs: Any) -> bool:
     """Equality of all columns to the last bit."""
     return all(
         np.array_equal(column, other, equal_nan=column.dtype.kind == "f")
         if isinstance(column, np.ndarray)
         else column == other
-        for column, other in zip(vars(mine).values(), vars(theirs).values(), strict=True)
+        for column, other in ((getattr(mine, field.name), getattr(theirs, field.name)) for field in fields(mine))
     )
 
 

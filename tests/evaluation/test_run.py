@@ -75,6 +75,10 @@ def slow(method, seconds: float):
     return slowed
 
 
+def off_by(path, offset):
+    return replace(path, positions=path.positions + offset)
+
+
 def map_of(positions: list[list[float]]) -> LandmarkMap:
     n = len(positions)
     return LandmarkMap(np.arange(7, 7 + n), np.reshape(positions, (n, 3)), np.full((n, 3, 3), np.nan))
@@ -199,7 +203,9 @@ IMPOSSIBLE = "causal covariance is impossible"
 @pytest.mark.parametrize(
     ("methods", "reason"),
     [
-        ({"process": changing(world_T_body=NAN_POSE)}, "pose is not finite in 39 of 40 rows, first at ns 2000000000"),
+        ({"process": changing(world_T_body=NAN_POSE)}, "causal pose is not finite in 39 of 40 rows, first at ns"),
+        ({"trajectory": lambda self: off_by(Offset.trajectory(self), np.nan)}, "smoothed pose is not finite in 40 of"),
+        ({"landmarks": lambda _: replace(map_of([[0.0] * 3]), covariances=-np.eye(3)[None])}, "at landmark 7"),
         ({"process": changing(covariance=np.diag([1.0] * 5 + [-1e-3]))}, f"{IMPOSSIBLE} in 39 of 40 rows"),
         ({"process": changing(covariance=np.eye(6) + 0.5 * np.eye(6, k=1))}, IMPOSSIBLE),
         ({"process": changing(covariance=np.where(np.eye(6) > 0, np.nan, 0.0))}, IMPOSSIBLE),

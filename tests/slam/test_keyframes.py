@@ -167,12 +167,16 @@ def test_gravity_tells_the_tilt_of_a_tilted_vehicle():
 
 
 def test_the_direction_of_gravity_is_as_doubtful_as_the_velocities_at_both_ends():
-    """Beside what the IMU adds: the change of a velocity that is known to sigma at either end, over 2 s and g."""
-    sigmas = np.array([0.1, 0.2])
-    logs = [DvlCalibration(velocity_sigma_m_s=(sigma,) * 3) for sigma in sigmas.tolist()]
-    factors = [factor_of(driven(Calibration(imu=NO_BIAS, dvl=log), 2.0), gtsam.MagPoseFactorPose3) for log in logs]
-    variances = [factor.noiseModel().sigma() ** 2 for factor in factors]
-    assert np.diff(variances) == pytest.approx(2 * np.diff(sigmas**2) / (2.0 * G) ** 2, rel=1e-3)
+    """Beside what the IMU adds: the change of a velocity with these sigmas at its ends, over 2 s and g."""
+    ends, variances = np.array([(0.1, 0.1), (0.2, 0.2), (0.1, 0.2), (0.2, 0.1)]), []
+    for first, others in ends:
+        keyframes, rows = keyframes_of(Calibration(imu=NO_BIAS)), steady_dvl(2.0)
+        sigmas = np.where(np.arange(len(rows)) == 0, first, others)
+        rows = replace(rows, velocity_cov=sigmas[:, None, None] ** 2 * np.eye(3))
+        keyframes.add(level_imu(2.0), rows, None)
+        keyframes.advance(int(at(2.0)[0]))
+        variances.append(factor_of(keyframes, gtsam.MagPoseFactorPose3).noiseModel().sigma() ** 2)
+    assert np.diff(variances) == pytest.approx(np.diff((ends**2).sum(axis=1)) / (2.0 * G) ** 2, rel=1e-3, abs=1e-9)
 
 
 def test_velocity_is_taken_to_the_imu_before_gravity_is():

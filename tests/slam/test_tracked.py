@@ -152,6 +152,7 @@ USED_LATER, FORGOTTEN, TAKEN_BACK = Outcome.USED_LATER, Outcome.FORGOTTEN, Outco
 NONE, DOUBTFUL = [0.0] * 4, [0.1, 0.6, 0.1, 0.1]
 TOLD = {
     "too late": (2.0, [(0.0, FLAT), (1.0, FLAT), (2.5, FLAT)], [FORGOTTEN, WAITING, WAITING]),
+    "of no landmark": (2.0, [(0.0, FLAT), (0.5, NONE), (3.0, None)], [Outcome.NO_IDENTITY, Outcome.NO_IDENTITY]),
     "too late without another frame": (2.0, [(0.0, FLAT), (5.0, None)], [FORGOTTEN]),
     "the rest in time": (2.0, [(0.9, FLAT), (1.0, FLAT), (3.0, SURE[5])], [FORGOTTEN, USED_LATER, USED]),
     "taken back, and too late for another landmark": (

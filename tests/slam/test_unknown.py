@@ -226,8 +226,9 @@ def nearest(
     frames: dict[int, list[int]],
     log_rival: float = 0.0,
     ranges_m: tuple[float, ...] = (2.0, 2.0),
+    rooted: tuple[int, ...] = (),
 ) -> tuple[int, int] | None:
-    """Of landmarks at points with a joint covariance, each seen in some frames."""
+    """Of landmarks at points with a joint covariance, each seen in some frames; rooted ones also before the window."""
     smoother = smoother_with(1e9, 0.1, 1e9)
     landmarks = LandmarkSightings(smoother, SightingFactors(SonarCalibration(), plain))
     values = gtsam.Values()
@@ -237,6 +238,8 @@ def nearest(
             noise = np.diag([NOISE_M**2, (NOISE_M / 2) ** 2])
             sighting = Sighting(stamp_ns, 0, Sightline(X(0), gtsam.Pose3(), np.array([range_m, 0.0])), noise, None)
             landmarks.enter(sighting, i, [])
+        if i in rooted:
+            landmarks._rooted[i] = sighting
     joint = JointCovariance(cov, {L(i): 3 * k for k, i in enumerate(points)})
     merging = LandmarkMerging(landmarks, PROBABILITY, log_rival)
     return merging.nearest(values, joint, named, [i for i in points if i not in named])
@@ -271,9 +274,9 @@ def test_the_noise_of_two_sightings_is_the_larger_one_and_across_the_beam_where_
     assert_gate(sigma_m, 0.001, 1.0, [], ranges_m=ranges_m)
 
 
-def test_two_of_one_frame_stay_two():
-    for frames, merged in (([2, 3], None), ([3, 4], (5, 7))):
-        assert nearest(TOGETHER, shared(2, 1.0, 0.05), [], {5: [1, 2], 7: frames}) == merged
+def test_two_of_one_frame_stay_two_and_so_do_those_that_left_the_window():
+    for frames, rooted, merged in (([2, 3], (), None), ([3, 4], (), (5, 7)), ([3, 4], (7,), None)):
+        assert nearest(TOGETHER, shared(2, 1.0, 0.05), [], {5: [1, 2], 7: frames}, rooted=rooted) == merged
 
 
 @pytest.mark.parametrize("own_sigma", [0.1, 1.0])

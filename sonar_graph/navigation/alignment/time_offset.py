@@ -70,9 +70,9 @@ class LeastSquaresFit:
 def fit(stretches: Sequence[SampleSeries], prior_sigmas: Floats, ratios: Floats | None = None) -> LeastSquaresFit:
     """Fit the common parameters.
 
-    ``stretches``: at least one, with more differences in all than parameters; ``prior_sigmas``: of the common
-    parameters about zero, shape (p,): so wide that they matter only where the data say nothing. A parameter whose
-    covariance is the prior's was not observed; ``ratios``: of the noises; None: estimated from the data.
+    ``stretches``: at least one, with more differences in all than parameters. ``prior_sigmas``: of the common
+    parameters about zero, shape (p,), so wide that they matter only where the data say nothing; a parameter whose
+    covariance is the prior's was not observed. ``ratios``: of the noises; None: estimated from the data.
     """
     if ratios is None:
         rate = 1.0 / float(np.concatenate([s.duration_s for s in stretches]).mean())

@@ -68,12 +68,10 @@ class Open:
 def left_open(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, keys: Iterable[int], least_said: float = 0.0
 ) -> list[Open]:
-    """Directions of some variables that the factors leave open, given all other variables.
+    """Directions of some variables that the factors leave open, given all others; none where a derivative is NaN.
 
     ``values``: of all variables of the factors; ``keys``: the variables that are not taken as known; ``least_said``:
     whitened rows of A shorter than this, such as `LEAST_SAID`, count as zero.
-
-    Returns nothing where a derivative is no number (`not_finite`).
     """
     places, size = {}, 0
     for key in keys:
