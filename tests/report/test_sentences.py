@@ -126,7 +126,7 @@ def test_odometry_far_from_its_reference_asks_for_inspect_and_nothing_else_does(
         assert (hint in text) == is_told, (name, value)
     told = replace(blind, sequence=replace(blind.sequence, notes={"truth": "of the same sensors"}))
     text = printed(with_score(told, "isam2", "causal.nees_position", nees(30.0)), 200)
-    assert "stamps, start or reference (of the same sensors) may be off" in text
+    assert "stamps, start or reference (the log says: of the same sensors) may be off" in text
 
 
 KEY = "causal.ate_se2_m"
