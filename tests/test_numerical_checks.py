@@ -4,7 +4,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from sonar_graph.testing import check_consistent, check_jacobians
+from sonar_graph.testing import check_consistent, check_derivative, check_jacobians
 
 NOISE = gtsam.noiseModel.Diagonal.Sigmas(np.array([0.1, 0.2]))
 
@@ -27,11 +27,27 @@ def bearing_range_like(wrong: float) -> tuple[gtsam.CustomFactor, gtsam.Values]:
 def test_right_derivatives_pass_and_a_wrong_one_or_nan_is_named():
     check_jacobians(*bearing_range_like(1.0))
     for wrong, said in (
-        (1.001, r"error 1 by direction 0 of 7: the factor says -0\.325\d+, differences say"),
+        (1.001, r"variable 7: derivative of row 1 by direction 0: stated -0\.325\d+, by differences"),
         (np.nan, "nan"),
     ):
         with pytest.raises(AssertionError, match=said):
             check_jacobians(*bearing_range_like(wrong))
+
+
+def test_a_derivative_has_the_shape_of_the_value_and_angles_are_wrapped():
+    check_derivative(lambda x: x[0] * x[1], [3.0, 2.0], at=[2.0, 3.0])
+    check_derivative(lambda x: np.outer(x, x), [[[2, 0], [1, 1]], [[1, 1], [0, 2]]], at=[1.0, 1.0])
+    with pytest.raises(ValueError, match=r"expected a Jacobian of shape \(2,\), not \(1, 2\)"):
+        check_derivative(lambda x: x[0] * x[1], [[3.0, 2.0]], at=[2.0, 3.0])
+    with pytest.raises(AssertionError, match="row 0, 1 by direction 1: stated 7, by differences 1"):
+        check_derivative(lambda x: np.outer(x, x), [[[2, 0], [1, 7]], [[1, 1], [0, 2]]], at=[1.0, 1.0])
+
+    def azimuth(p: np.ndarray) -> np.ndarray:
+        return np.array([np.arctan2(p[1], p[0])])
+
+    check_derivative(azimuth, [[0.0, -1.0]], at=[-1.0, 0.0], angles=[0])
+    with pytest.raises(AssertionError, match="row 0"):
+        check_derivative(azimuth, [[0.0, -1.0]], at=[-1.0, 0.0])
 
 
 def test_columns_belong_to_their_variables():
@@ -100,5 +116,5 @@ def test_a_row_is_judged_by_its_own_size() -> None:
 
     values = gtsam.Values()
     values.insert(0, np.zeros(2))
-    with pytest.raises(AssertionError, match="error 1 by direction 1"):
+    with pytest.raises(AssertionError, match="row 1 by direction 1"):
         check_jacobians(gtsam.CustomFactor(NOISE, [0], error), values)

@@ -1,4 +1,7 @@
-"""Numerical checks of factors and covariances: Jacobians by central differences, NEES by its two-sided band."""
+"""Numerical checks of derivatives and covariances: Jacobians by central differences, NEES by its two-sided band."""
+
+import math
+from collections.abc import Callable, Sequence
 
 import gtsam
 import numpy as np
@@ -8,10 +11,85 @@ from scipy.stats import chi2
 from sonar_graph.measurements import Floats
 
 
+def central_differences(
+    function: Callable[[Floats], ArrayLike], at: ArrayLike, *, angles: Sequence[int] = (), step: float = 1e-5
+) -> Floats:
+    """Derivative by differences, ``(f(x + step u_k) - f(x - step u_k)) / (2 step)`` along the last axis.
+
+    Arguments as of `check_derivative`; shape that of the value, followed by (n,).
+    """
+    x, columns = np.asarray(at, np.float64), []
+    for direction in np.eye(len(x)):
+        change = np.subtract(function(x + step * direction), function(x - step * direction), dtype=np.float64)
+        for row in angles:
+            change[row] = math.remainder(change[row], 2 * math.pi)
+        columns.append(change / (2 * step))
+    return np.stack(columns, axis=-1)
+
+
+def check_derivative(
+    function: Callable[[Floats], ArrayLike],
+    jacobian: ArrayLike,
+    at: ArrayLike,
+    *,
+    angles: Sequence[int] = (),
+    step: float = 1e-5,
+    tolerance: float = 1e-5,
+) -> None:
+    """Compare the derivative of a function of a vector with central differences.
+
+    Parameters
+    ----------
+    function
+        Function ``f`` of a vector, shape (n,); its value has any shape, such as (m,). A function of a pose is checked
+        as one of its perturbation, at zero: ``lambda d: f(pose.retract(d))``.
+    jacobian
+        Stated derivative, shape (m, n): that of the value, followed by (n,).
+    at
+        Vector x at which it is stated, shape (n,).
+    angles
+        Rows of the value that are angles, whose differences are wrapped.
+    step
+        Length of the differences.
+    tolerance
+        Largest difference allowed in a row, relative to the largest entry of the row; absolute below 1.
+
+    Raises
+    ------
+    ValueError
+        When the Jacobian has another shape.
+    AssertionError
+        Naming row and column of the largest difference, with both numbers.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sonar_graph.testing import check_derivative
+    >>> def polar(p):
+    ...     return np.array([np.hypot(*p), np.arctan2(p[1], p[0])])
+    >>> check_derivative(polar, [[0.6, 0.8], [-0.16, 0.12]], at=[3.0, 4.0], angles=[1])
+    >>> check_derivative(polar, [[0.6, 0.8], [0.16, 0.12]], at=[3.0, 4.0], angles=[1])
+    Traceback (most recent call last):
+        ...
+    AssertionError: derivative of row 1 by direction 0: stated 0.16, by differences -0.16
+    """
+    stated, numeric = np.asarray(jacobian, np.float64), central_differences(function, at, angles=angles, step=step)
+    if stated.shape != numeric.shape:
+        raise ValueError(f"expected a Jacobian of shape {numeric.shape}, not {stated.shape}")
+    largest = np.fmax(np.abs(stated), np.abs(numeric)).max(axis=-1, keepdims=True)
+    off = np.abs(stated - numeric) / np.fmax(1.0, largest)
+    if not off.max() <= tolerance:
+        *row, k = place = np.unravel_index(int(np.argmax(np.where(np.isnan(off), np.inf, off))), off.shape)
+        raise AssertionError(
+            f"derivative of row {', '.join(map(str, row)) or 0} by direction {k}:"
+            f" stated {stated[tuple(place)]:.9g}, by differences {numeric[tuple(place)]:.9g}"
+        )
+
+
 def check_jacobians(
     factor: gtsam.NoiseModelFactor, values: gtsam.Values, *, step: float = 1e-5, tolerance: float = 1e-5
 ) -> None:
-    """Compare the Jacobians of a factor with central differences of its error.
+    """Compare the Jacobians of a factor with central differences of its error, by `check_derivative`.
 
     With ``x (+) d`` the retraction of GTSAM and ``u_k`` the unit vector of tangent direction k, column k of a Jacobian
     must be ``(e(x (+) step u_k) - e(x (+) -step u_k)) / (2 step)``.
@@ -56,26 +134,21 @@ def check_jacobians(
         raise ValueError("expected a factor of different variables; one is named twice")
     whitened = np.asarray(factor.linearize(values).jacobian()[0])
     jacobians = np.linalg.solve(np.asarray(noise.R()), whitened)  # linearize gives R J, R^T R the information
-    zero, column = values.zeroVectors(), 0
+    zeros, column = values.zeroVectors(), 0
     for key in factor.keys():  # noqa: SIM118  # no dictionary
-        size = len(zero.at(key))
-        analytic = jacobians[:, column : column + size]
-        numeric = np.empty_like(analytic)
-        for k, direction in enumerate(np.eye(size)):
-            ahead, behind = gtsam.VectorValues(), gtsam.VectorValues()
-            ahead.insert(key, step * direction)
-            behind.insert(key, -step * direction)
-            change = factor.unwhitenedError(values.retract(ahead)) - factor.unwhitenedError(values.retract(behind))
-            numeric[:, k] = change / (2 * step)
-        largest = np.fmax(np.abs(analytic), np.abs(numeric)).max(axis=1, keepdims=True)
-        off = np.abs(analytic - numeric) / np.fmax(1.0, largest)
-        if not off.max() <= tolerance:
-            row, k = divmod(int(np.argmax(np.where(np.isnan(off), np.inf, off))), size)
-            raise AssertionError(
-                f"derivative of error {row} by direction {k} of {gtsam.DefaultKeyFormatter(key)}: the factor says"
-                f" {analytic[row, k]:.9g}, differences say {numeric[row, k]:.9g}"
-            )
-        column += size
+
+        def error_after(change: Floats, key: int = key) -> Floats:
+            step_of_one = gtsam.VectorValues()
+            step_of_one.insert(key, change)
+            return np.asarray(factor.unwhitenedError(values.retract(step_of_one)))
+
+        zero = zeros.at(key)
+        try:
+            stated = jacobians[:, column : column + len(zero)]
+            check_derivative(error_after, stated, zero, step=step, tolerance=tolerance)
+        except AssertionError as error:
+            raise AssertionError(f"variable {gtsam.DefaultKeyFormatter(key)}: {error}") from None
+        column += len(zero)
 
 
 def check_consistent(nees: ArrayLike, dof: int, *, confidence: float = 0.99) -> None:
