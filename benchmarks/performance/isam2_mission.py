@@ -28,8 +28,8 @@ from common import conclude, make_parser, note, print_table
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import LandmarkDetections, Measurements
-from sonar_graph.navigation import Odometry
-from sonar_graph.navigation.preintegration import PreintegratedMotion, Preintegrator
+from sonar_graph.navigation import Odometry, PreintegratedMotion
+from sonar_graph.navigation.preintegration import Preintegrator
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
 from sonar_graph.slam.isam2 import Isam2

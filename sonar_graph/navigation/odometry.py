@@ -26,9 +26,9 @@ from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints
 from sonar_graph.navigation.dvl_screening import RowIntake
 from sonar_graph.navigation.imu_gaps import NO_TURNS, turn_values
+from sonar_graph.navigation.motion import Motions, PreintegratedMotion
 from sonar_graph.navigation.preintegration import (
     Columns,
-    PreintegratedMotion,
     Preintegrator,
     Steps,
     are_nodes,
@@ -82,6 +82,12 @@ class Odometry:
         self._hold_past = calibration.odometry_interpolation == "hold-past"
         self._turns = NO_TURNS if self._hold_past else turn_values(calibration.imu)
         self._longest_ns = longest_interval_ns(calibration)
+        self._preintegrator = Preintegrator.from_calibration(calibration)
+        latitude = calibration.earth_rate_latitude_rad
+        self._calibration_earth = None
+        if latitude is not None:
+            self._calibration_earth = 7.292115e-5 * np.array([0.0, np.cos(latitude), np.sin(latitude)])
+        self._dvl_p_imu = np.subtract(calibration.imu.mounting.translation_m, calibration.dvl.mounting.translation_m)
 
     @property
     def refused(self) -> list[RefusedRow]:
@@ -220,6 +226,55 @@ class Odometry:
             f"{', '.join(nodes)}: IMU rows ({covered}) do not cover {', '.join(map(str, nodes.values()))}; take nodes"
             " from start_ns() on, of nodes()"
         )
+
+    def epochs(self, after_ns: int, until_ns: int) -> Ints:
+        """Epochs after one instant that are reached at another, in order, shape (n,)."""
+        return self.nodes(after_ns, until_ns)
+
+    def reached_ns(self, epochs_ns: Ints) -> Ints:
+        """Instants at which epochs are reached: stamps of the first IMU rows at or after them, shape (n,)."""
+        return self._imu.stamps_ns[np.searchsorted(self._imu.stamps_ns, epochs_ns)]
+
+    def motion(
+        self, start_ns: int, end_ns: int, bias: Floats, world_R_i: Floats | None = None, known_ns: int | None = None
+    ) -> PreintegratedMotion:
+        """Motion from one instant to another, over gaps too, from rows stamped no later than an instant."""
+        earth = self._calibration_earth
+        earth_rate = None if earth is None or world_R_i is None else world_R_i.T @ earth
+        known = end_ns if known_ns is None else known_ns
+        if are_nodes(self._imu.stamps_ns, self._dvl.stamps_ns, start_ns, end_ns) and (
+            known_ns is None or self.reached_ns(np.array([end_ns]))[0] <= known
+        ):
+            return motion_between_nodes(self, self._preintegrator, start_ns, end_ns, bias, earth_rate)
+        if earth_rate is None:
+            return motion_between(self, self._preintegrator, start_ns, end_ns, bias)
+        return RunningMotion(self, self._preintegrator, start_ns, bias, earth_rate).until(end_ns)
+
+    def motions(self, start_ns: Ints, end_ns: Ints, known_ns: Ints, bias: Floats) -> Motions:
+        """Motions over intervals, each from rows stamped no later than its ``known_ns``."""
+        imu_ns, dvl_ns = self._imu.stamps_ns, self._dvl.stamps_ns
+        found = []
+        for start, end, known in zip(start_ns.tolist(), end_ns.tolist(), known_ns.tolist(), strict=True):
+            inside = np.r_[start, dvl_ns[(dvl_ns > start) & (dvl_ns <= min(end, known))], end]
+            if np.diff(inside).max() > self._longest_ns:
+                nothing = (np.full(s, np.nan) for s in ((3, 3), 3, (6, 6), (6, 3), 3))
+                found.append(tuple(nothing))
+                continue
+            imu_rows, dvl_rows = (int(np.searchsorted(stamps, known, side="right")) for stamps in (imu_ns, dvl_ns))
+            motion = self._preintegrator.integrate(
+                Steps(*merge_rows(self.columns(), imu_rows, dvl_rows, start, end)), bias
+            )
+            pose = motion.i_T_j
+            impulse = motion.mean_specific_force * motion.duration_s if end > start else np.zeros(3)
+            found.append((pose.rotation().matrix(), pose.translation(), motion.covariance, motion.D_bias, impulse))
+        shapes = (-1, 3, 3), (-1, 3), (-1, 6, 6), (-1, 6, 3), (-1, 3)
+        columns = zip(*found, strict=True) if found else [()] * 5
+        return Motions(*(np.array(column).reshape(shape) for column, shape in zip(columns, shapes, strict=True)))
+
+    def velocity_at_imu(self, epoch_ns: int) -> tuple[Floats, float]:
+        """Velocity of the IMU's point at an epoch, body axes, shape (3,), m/s, and the variance of one component."""
+        velocity, cov, rate = self.velocity_at_node(epoch_ns)
+        return velocity + np.cross(rate, self._dvl_p_imu), float(np.trace(cov)) / 3.0
 
     def velocity_at_node(self, node_ns: int) -> tuple[Floats, Floats, Floats]:
         """DVL velocity (body axes), its covariance, and the angular rate at an epoch; shapes (3,), (3, 3), (3,)."""

@@ -17,7 +17,7 @@ from gtsam.symbol_shorthand import L, X
 
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats
-from sonar_graph.navigation.preintegration import PreintegratedMotion
+from sonar_graph.navigation import PreintegratedMotion
 from sonar_graph.numerics import compiled
 from sonar_graph.slam.smoother import JointCovariance, Smoother
 from sonar_graph.states import Estimate, Trajectory

@@ -17,7 +17,7 @@ from gtsam.symbol_shorthand import L
 
 from sonar_graph.calibration import Calibration, FloorPrior
 from sonar_graph.measurements import NO_TRACK, Floats, LandmarkDetections
-from sonar_graph.navigation.preintegration import PreintegratedMotion
+from sonar_graph.navigation import PreintegratedMotion
 from sonar_graph.slam.estimates import Solution
 from sonar_graph.slam.keyframes import Keyframes, without_unsound
 from sonar_graph.slam.landmarks import (

@@ -20,9 +20,16 @@ from pydantic import Field
 
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.measurements import Depth, Dvl, Floats, Imu, LandmarkDetections, possible_ranges
-from sonar_graph.navigation import Odometry, RunningMotion, in_numbers, motion_between_nodes, weights_at_end
+from sonar_graph.navigation import (
+    Odometry,
+    PreintegratedMotion,
+    RunningMotion,
+    in_numbers,
+    motion_between_nodes,
+    weights_at_end,
+)
 from sonar_graph.navigation.alignment import earth_rate_in_world, gravity_direction, velocity_at_imu
-from sonar_graph.navigation.preintegration import PreintegratedMotion, Preintegrator, Steps
+from sonar_graph.navigation.preintegration import Preintegrator, Steps
 from sonar_graph.numerics import compiled
 from sonar_graph.slam.models import factors
 from sonar_graph.slam.smoother import Smoother

@@ -19,11 +19,11 @@ from baselines.filter_motion import (
 from baselines.filter_window import NODE, OPENED, GravityInterval, VehicleModel, vehicle_model
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.measurements import Dvl, Imu
+from sonar_graph.navigation import Preintegrator
 from sonar_graph.navigation import odometry as node_motion
 from sonar_graph.navigation.imu_gaps import NO_TURNS
 from sonar_graph.navigation.odometry import Odometry
 from sonar_graph.navigation.preintegration.dvl_gaps import gap_values
-from sonar_graph.navigation.preintegration.motion import Preintegrator
 from sonar_graph.navigation.preintegration.recursion import NO_MOTION, in_last_frame
 from sonar_graph.numerics.jit import compiled
 from sonar_graph.numerics.mat3 import matrix, vector

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.errors import AlignmentError
 from sonar_graph.measurements import Dvl, Floats, Imu
+from sonar_graph.navigation import PreintegratedMotion, Preintegrator
 from sonar_graph.navigation.alignment.allan import allan_deviation, degrees_of_freedom, density, noise_densities
 from sonar_graph.navigation.alignment.at_rest import align_at_rest, covariance_at_rest
 from sonar_graph.navigation.alignment.gravity import (
@@ -24,7 +25,6 @@ from sonar_graph.navigation.alignment.gravity import (
     roll_and_pitch,
     velocity_at_imu,
 )
-from sonar_graph.navigation.preintegration.motion import PreintegratedMotion, Preintegrator
 from sonar_graph.navigation.preintegration.recursion import Steps
 from sonar_graph.testing import check_consistent
 

@@ -11,11 +11,11 @@ from sonar_graph.calibration import Calibration, ImuCalibration, Start
 from sonar_graph.errors import MeasurementError
 from sonar_graph.estimator import load_estimator
 from sonar_graph.measurements import Dvl, Imu, Measurements
+from sonar_graph.navigation import Preintegrator
 from sonar_graph.navigation.imu_gaps import NO_TURNS, closed_variance, hole_ns, open_variance, turn_psd
 from sonar_graph.navigation.odometry import Odometry, motion_between_nodes, motion_since_node
 from sonar_graph.navigation.preintegration.dvl_gaps import integral, line_before
 from sonar_graph.navigation.preintegration.joint_preintegration import JointPreintegrator
-from sonar_graph.navigation.preintegration.motion import Preintegrator
 from sonar_graph.testing import check_consistent
 
 from . import ways

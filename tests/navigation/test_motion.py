@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import CalibrationError, MeasurementError
+from sonar_graph.navigation import Preintegrator
 from sonar_graph.navigation.imu_gaps import NO_TURNS
-from sonar_graph.navigation.preintegration.motion import Preintegrator
 from sonar_graph.navigation.preintegration.recursion import Steps, merge_rows
 
 from . import ways

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from sonar_graph.calibration import ROWS_BEFORE, Calibration, DvlCalibration
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Dvl, Imu
+from sonar_graph.navigation import PreintegratedMotion, Preintegrator
 from sonar_graph.navigation.odometry import (
     Odometry,
     RunningMotion,
@@ -18,7 +19,6 @@ from sonar_graph.navigation.odometry import (
     motion_between_nodes,
     motion_since_node,
 )
-from sonar_graph.navigation.preintegration.motion import PreintegratedMotion, Preintegrator
 from sonar_graph.navigation.preintegration.recursion import Steps
 from sonar_graph.navigation.samples import longest_interval_ns
 

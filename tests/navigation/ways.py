@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.measurements import Dvl, Imu
+from sonar_graph.navigation import PreintegratedMotion, Preintegrator
 from sonar_graph.navigation.odometry import Odometry, motion_between_nodes, motion_since_node
 from sonar_graph.navigation.preintegration.joint_preintegration import JointPreintegrator
 from sonar_graph.navigation.preintegration.joint_recursion import RULES
-from sonar_graph.navigation.preintegration.motion import PreintegratedMotion, Preintegrator
 
 from .rows import T0_NS, at, dvl, stamps
 

@@ -11,7 +11,7 @@ from gtsam.symbol_shorthand import B, L, X
 from numpy.typing import ArrayLike
 
 from sonar_graph.measurements import Floats, LandmarkDetections
-from sonar_graph.navigation.preintegration.motion import PreintegratedMotion
+from sonar_graph.navigation import PreintegratedMotion
 from sonar_graph.sequence import Sequence
 from sonar_graph.settings import nested
 from sonar_graph.slam import Isam2, Isam2Params

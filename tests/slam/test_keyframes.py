@@ -20,8 +20,8 @@ from sonar_graph.calibration import (
     Start,
 )
 from sonar_graph.measurements import Depth, Dvl, Imu
+from sonar_graph.navigation import PreintegratedMotion
 from sonar_graph.navigation.alignment.gravity import earth_rate_in_world
-from sonar_graph.navigation.preintegration.motion import PreintegratedMotion
 from sonar_graph.slam.keyframes import KeyframeParams, Keyframes, positive_definite
 from tests.navigation.rows import NS, T0_NS, dvl, imu, stamps
 

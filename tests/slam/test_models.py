@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from sonar_graph.measurements import Floats
-from sonar_graph.navigation.preintegration.motion import PreintegratedMotion
+from sonar_graph.navigation import PreintegratedMotion
 from sonar_graph.slam.models.prediction import PredictedView, Source, weigh
 from sonar_graph.slam.models.sonar_model import (
     elevation_on_floor,

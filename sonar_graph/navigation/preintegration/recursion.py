@@ -1,7 +1,7 @@
 """Steps of gyro and Doppler rows, and the recursion of preintegration over them, as machine code.
 
 Rows of both sensors are merged into steps of constant rate and velocity, on which every estimator moves. The equations
-are those of `sonar_graph.navigation.preintegration.motion`, with the rotation's perturbation kept in frame i until the
+are those of `.preintegrator`, with the rotation's perturbation kept in frame i until the
 end (``theta_i = dR theta``), where it needs no transport::
 
     theta_i <- theta_i + dR J_l dt d

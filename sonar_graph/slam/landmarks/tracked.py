@@ -22,7 +22,7 @@ from pydantic import Field
 
 from sonar_graph.calibration import Section
 from sonar_graph.measurements import NO_TRACK, LandmarkDetections
-from sonar_graph.navigation.preintegration import PreintegratedMotion
+from sonar_graph.navigation import PreintegratedMotion
 from sonar_graph.slam.landmarks.association import gate_threshold
 from sonar_graph.slam.landmarks.sighting import LandmarkSightings, Sighting
 from sonar_graph.slam.landmarks.unknown import IgnoredUnknown, UnknownParams

@@ -28,7 +28,7 @@ from scipy.integrate import quad
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Floats
-from sonar_graph.navigation.preintegration import PreintegratedMotion
+from sonar_graph.navigation import PreintegratedMotion
 from sonar_graph.settings import tagged
 from sonar_graph.slam.models.sonar_model import range_azimuth_jacobians, wrap_angle
 

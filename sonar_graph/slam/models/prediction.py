@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 
 from sonar_graph.measurements import Floats, Ints
-from sonar_graph.navigation.preintegration import PreintegratedMotion
+from sonar_graph.navigation import PreintegratedMotion
 from sonar_graph.numerics import compiled, skew
 from sonar_graph.slam.models.sonar_model import project, wrap_angle
 from sonar_graph.slam.smoother import JointCovariance

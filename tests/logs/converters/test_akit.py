@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from sonar_graph.calibration import Mounting
 from sonar_graph.logs.convert.akit import earth_centred, east_north_up, enu_R_flu, read_akit
+from sonar_graph.navigation import Preintegrator
 from sonar_graph.navigation.odometry import Odometry, motion_between_nodes
-from sonar_graph.navigation.preintegration.motion import Preintegrator
 
 LATITUDE = 0.5733
 EARTH_RATE_RAD_S = 7.292115e-5

@@ -27,65 +27,10 @@ import numpy as np
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import CalibrationError
 from sonar_graph.measurements import Floats
+from sonar_graph.navigation.motion import PreintegratedMotion
 from sonar_graph.navigation.preintegration.dvl_gaps import GapValues, bridge, gap_values
 from sonar_graph.navigation.preintegration.recursion import Columns, Steps, in_last_frame, integrate_steps, trace_point
 from sonar_graph.navigation.samples import finite_vector, require_noise
-from sonar_graph.numerics import compiled
-
-
-@dataclass(frozen=True, eq=False)
-class PreintegratedMotion:
-    """Motion from body frame i to body frame j, with its covariance and its derivative by the gyro bias.
-
-    Examples
-    --------
-    Ten steps of 0.1 s at 0.5 m/s, and the same again, as one motion:
-
-    >>> import numpy as np
-    >>> from sonar_graph.navigation import Preintegrator
-    >>> from sonar_graph.navigation.preintegration import Steps
-    >>> zeros, ahead = np.zeros((10, 3)), np.tile([0.5, 0.0, 0.0], (10, 1))
-    >>> steps = Steps(np.full(10, 0.1), zeros, ahead, np.zeros((10, 3, 3)), zeros, zeros)
-    >>> motion = Preintegrator(1e-4, np.zeros(3)).integrate(steps, np.zeros(3))
-    >>> twice = motion.then(motion)
-    >>> round(float(twice.i_T_j.x()), 6), round(twice.duration_s, 6)
-    (1.0, 2.0)
-    """
-
-    i_T_j: gtsam.Pose3
-    """Mean, for the gyro bias `bias`."""
-    covariance: Floats
-    """Covariance of the perturbation [rotation, translation] in frame j, shape (6, 6)."""
-    D_bias: Floats
-    """Derivative of the same perturbation by the gyro bias, shape (6, 3), per rad/s."""
-    bias: Floats
-    """Gyro bias that was removed, shape (3,), rad/s."""
-    duration_s: float
-    mean_specific_force: Floats
-    """Mean over time of the specific force, turned into frame i, shape (3,), m/s²; NaN where not measured."""
-
-    def then(self, next_motion: PreintegratedMotion) -> PreintegratedMotion:
-        """The motion followed by the next one, for the same gyro bias.
-
-        ``i_T_k = i_T_j j_T_k``; a perturbation of the first reaches frame k through ``Ad(j_T_k^-1)``.
-        """
-        i_R_j = self.i_T_j.rotation().matrix()
-        cov, D, force = chain_covariances(
-            next_motion.i_T_j.inverse().AdjointMap(),
-            self.covariance,
-            self.D_bias,
-            next_motion.covariance,
-            next_motion.D_bias,
-            self.mean_specific_force * self.duration_s,
-            i_R_j @ next_motion.mean_specific_force * next_motion.duration_s,
-        )
-        duration_s = self.duration_s + next_motion.duration_s
-        i_T_k = self.i_T_j.compose(next_motion.i_T_j)
-        return PreintegratedMotion(i_T_k, cov, D, self.bias, duration_s, force / duration_s)
-
-    def corrected(self, bias: Floats) -> gtsam.Pose3:
-        """i_T_j for another gyro bias, to first order: ``i_T_j Exp(D_bias (bias - self.bias))``."""
-        return self.i_T_j.compose(gtsam.Pose3.Expmap(self.D_bias @ (bias - self.bias)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,14 +151,6 @@ class Preintegrator:
             Shape (n, 3), m; linear within a step.
         """
         return trace_point(steps.duration_s, steps.rate, steps.velocity, bias, self.body_p_dvl, point, offsets_s)
-
-
-@compiled
-def chain_covariances(
-    A: Floats, cov: Floats, D: Floats, next_cov: Floats, next_D: Floats, impulse: Floats, next_impulse: Floats
-) -> tuple[Floats, Floats, Floats]:
-    """Covariance, bias derivative and impulse of two successive motions, A the adjoint of the second's inverse."""
-    return A @ cov @ A.T + next_cov, A @ D + next_D, impulse + next_impulse
 
 
 def float_triple(a: Floats) -> tuple[float, float, float]:

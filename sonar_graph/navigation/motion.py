@@ -1,0 +1,157 @@
+"""Motion between two instants: its value, and the contract of its source.
+
+A motion i_T_j is the mean of what gyros and Doppler log measured from instant i to instant j, with one covariance and
+the derivative by the gyro bias. Its perturbation is [rotation, translation] in the last frame j::
+
+    i_R_j = dR Exp(theta),    i_p_j = dp + dR rho,    [theta; rho] = D (bias - bias_0) + n,    n ~ N(0, C)
+
+Epochs are the stamps of the Doppler log: between two of them the velocity is known on both sides and the motion is
+final. An epoch counts as reached once an IMU row at or after it has come. docs/theory/preintegration.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import gtsam
+
+from sonar_graph.measurements import Dvl, Floats, Imu, Ints
+from sonar_graph.states import RefusedRow
+
+
+@dataclass(frozen=True, eq=False)
+class PreintegratedMotion:
+    """Motion from body frame i to body frame j, with its covariance and its derivative by the gyro bias.
+
+    Examples
+    --------
+    Ten steps of 0.1 s at 0.5 m/s, and the same again, as one motion:
+
+    >>> import numpy as np
+    >>> from sonar_graph.navigation import Preintegrator
+    >>> from sonar_graph.navigation.preintegration import Steps
+    >>> zeros, ahead = np.zeros((10, 3)), np.tile([0.5, 0.0, 0.0], (10, 1))
+    >>> steps = Steps(np.full(10, 0.1), zeros, ahead, np.zeros((10, 3, 3)), zeros, zeros)
+    >>> motion = Preintegrator(1e-4, np.zeros(3)).integrate(steps, np.zeros(3))
+    >>> twice = motion.then(motion)
+    >>> round(float(twice.i_T_j.x()), 6), round(twice.duration_s, 6)
+    (1.0, 2.0)
+    """
+
+    i_T_j: gtsam.Pose3
+    """Mean, for the gyro bias `bias`."""
+    covariance: Floats
+    """Covariance of the perturbation [rotation, translation] in frame j, shape (6, 6)."""
+    D_bias: Floats
+    """Derivative of the same perturbation by the gyro bias, shape (6, 3), per rad/s."""
+    bias: Floats
+    """Gyro bias that was removed, shape (3,), rad/s."""
+    duration_s: float
+    mean_specific_force: Floats
+    """Mean over time of the specific force, turned into frame i, shape (3,), m/s²; NaN where not measured."""
+
+    def then(self, next_motion: PreintegratedMotion) -> PreintegratedMotion:
+        """The motion followed by the next one, for the same gyro bias.
+
+        ``i_T_k = i_T_j j_T_k``; a perturbation of the first reaches frame k through ``Ad(j_T_k^-1)``.
+        """
+        A = next_motion.i_T_j.inverse().AdjointMap()
+        i_R_j, duration_s = self.i_T_j.rotation().matrix(), self.duration_s + next_motion.duration_s
+        impulse = self.mean_specific_force * self.duration_s
+        impulse += i_R_j @ next_motion.mean_specific_force * next_motion.duration_s
+        return PreintegratedMotion(
+            self.i_T_j.compose(next_motion.i_T_j),
+            A @ self.covariance @ A.T + next_motion.covariance,
+            A @ self.D_bias + next_motion.D_bias,
+            self.bias,
+            duration_s,
+            impulse / duration_s,
+        )
+
+    def corrected(self, bias: Floats) -> gtsam.Pose3:
+        """i_T_j for another gyro bias, to first order: ``i_T_j Exp(D_bias (bias - self.bias))``."""
+        return self.i_T_j.compose(gtsam.Pose3.Expmap(self.D_bias @ (bias - self.bias)))
+
+
+class Motions(NamedTuple):
+    """Motions over n intervals, as arrays; all NaN for an interval that has a gap of the Doppler log."""
+
+    dR: Floats
+    """i_R_j, shape (n, 3, 3)."""
+    dp: Floats
+    """i_p_j, shape (n, 3), m."""
+    C: Floats
+    """Covariance of [theta, rho] in frame j, shape (n, 6, 6)."""
+    D: Floats
+    """Derivative of [theta, rho] by the gyro bias, shape (n, 6, 3), per rad/s."""
+    impulse: Floats
+    """Integral of the specific force in frame i, shape (n, 3), m/s; NaN where not measured."""
+
+
+class MotionSource(Protocol):
+    """Contract of the source of motion that is handed to an estimator, such as `sonar_graph.navigation.Odometry`.
+
+    What a motion uses depends on stamps alone, not on how a log is cut into blocks.
+    """
+
+    @property
+    def refused(self) -> list[RefusedRow]:
+        """Rows that are not used, with the reason."""
+        ...
+
+    def add(self, imu: Imu | None, dvl: Dvl | None) -> bool:
+        """Take in rows; True where some were placed before others: provisional motions are out of date."""
+        ...
+
+    def start_by(self, until_ns: int) -> int | None:
+        """First epoch, if it is reached at an instant; else None."""
+        ...
+
+    def epochs(self, after_ns: int, until_ns: int) -> Ints:
+        """Epochs after one instant that are reached at another, in order, shape (n,)."""
+        ...
+
+    def reached_ns(self, epochs_ns: Ints) -> Ints:
+        """Instants at which epochs are reached: stamps of the first IMU rows at or after them, shape (n,)."""
+        ...
+
+    def is_gap(self, start_ns: int, end_ns: int) -> bool:
+        """True for a time without Doppler rows that is too long for a linear velocity."""
+        ...
+
+    def motion(
+        self, start_ns: int, end_ns: int, bias: Floats, world_R_i: Floats | None = None, known_ns: int | None = None
+    ) -> PreintegratedMotion:
+        """Motion from one instant to another, over gaps too, from rows stamped no later than an instant.
+
+        Parameters
+        ----------
+        bias
+            Gyro bias in body axes to remove, shape (3,), rad/s.
+        world_R_i
+            Attitude at the start, shape (3, 3), to remove the Earth's rotation where the calibration says so; None:
+            it is not removed.
+        known_ns
+            Rows stamped later are not used; None: ``end_ns``, or the instant at which it is reached if it is an epoch.
+        """
+        ...
+
+    def motions(self, start_ns: Ints, end_ns: Ints, known_ns: Ints, bias: Floats) -> Motions:
+        """Motions over intervals, each from rows stamped no later than its ``known_ns``; the Earth's turn is left in.
+
+        All of shape (n,); ``bias`` (3,). Many at once, for filters: intervals with a gap are left to `motion`.
+        """
+        ...
+
+    def velocity_at_imu(self, epoch_ns: int) -> tuple[Floats, float]:
+        """Velocity of the IMU's point at an epoch, body axes, shape (3,), m/s, and the variance of one component."""
+        ...
+
+    def settle(self, epoch_ns: int) -> None:
+        """Declare the motion up to an epoch as used: rows stamped at or before it are late from now on."""
+        ...
+
+    def forget_before(self, epoch_ns: int) -> None:
+        """Settle, and drop rows that no motion from this epoch on can need."""
+        ...

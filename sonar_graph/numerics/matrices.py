@@ -1,0 +1,284 @@
+"""Vectors, 3 × 3 and 6 × 6 matrices with operators, and rotations: ``F @ P @ F.T + G @ C @ G.T`` as it is written.
+
+They are tuples. Inside a compiled function they live in registers, where an array of nine numbers is an allocation that
+costs as much as a product; outside, the same operators are ordinary methods. Rotations follow Forster et al.,
+"On-Manifold Preintegration", IEEE TRO 33(1), 2017, (3), (8). Euler angles are roll, pitch and yaw (phi, theta, psi)::
+
+    world_R_body = Rz(psi) Ry(theta) Rx(phi)
+    w = W (phi', theta', psi')^T        body rates from Euler rates
+    (phi', theta', psi')^T = E w        E = W^-1; infinite at theta = +-90 degrees
+
+A small rotation of the body, ``world_R_body Exp(delta)``, changes the angles by ``E delta``. Fossen, "Handbook of
+Marine Craft Hydrodynamics and Motion Control", 2011, (2.18), (2.28).
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numba.extending
+import numpy as np
+from numba import types
+
+from sonar_graph.measurements import Floats
+from sonar_graph.numerics.jit import inlined
+
+
+class Operators:
+    """Operators by the kinds of both operands, `RULES`."""
+
+    __array_ufunc__ = None  # numpy's numbers leave `s * A` to the rules
+
+    def __add__(self, other: Any) -> Any:
+        return _applied("add", self, other)
+
+    def __sub__(self, other: Any) -> Any:
+        return _applied("sub", self, other)
+
+    def __matmul__(self, other: Any) -> Any:
+        return _applied("matmul", self, other)
+
+    def __rmul__(self, scale: Any) -> Any:
+        return _applied("mul", scale, self)
+
+    @property
+    def T(self) -> Any:
+        """Transpose."""
+        return TRANSPOSES[type(self)](self)
+
+
+class Vec3(Operators, NamedTuple("Vec3", [("x", float), ("y", float), ("z", float)])):
+    """Vector; ``a @ b`` is the scalar product."""
+
+
+class Mat3(Operators, NamedTuple("Mat3", [("x", Vec3), ("y", Vec3), ("z", Vec3)])):
+    """Matrix of three rows."""
+
+
+class Skew(Operators, NamedTuple("Skew", [("v", Vec3)])):
+    """Matrix ``[v]x`` with ``[v]x w = v x w``."""
+
+
+class Vec6(Operators, NamedTuple("Vec6", [("a", Vec3), ("b", Vec3)])):
+    """Vector of two halves."""
+
+
+class Mat6(Operators, NamedTuple("Mat6", [("a", Mat3), ("b", Mat3), ("c", Mat3), ("d", Mat3)])):
+    """Matrix of four blocks, ``[[a, b], [c, d]]``."""
+
+
+extending: Any = numba.extending
+Rule = Callable[[Any, Any], Any]
+RULES: dict[str, dict[tuple[type, type], Rule]] = {
+    "add": {
+        (Vec3, Vec3): lambda a, b: Vec3(a.x + b.x, a.y + b.y, a.z + b.z),
+        (Mat3, Mat3): lambda a, b: Mat3(a.x + b.x, a.y + b.y, a.z + b.z),
+        (Vec6, Vec6): lambda a, b: Vec6(a.a + b.a, a.b + b.b),
+        (Mat6, Mat6): lambda a, b: Mat6(a.a + b.a, a.b + b.b, a.c + b.c, a.d + b.d),
+    },
+    "sub": {
+        (Vec3, Vec3): lambda a, b: Vec3(a.x - b.x, a.y - b.y, a.z - b.z),
+        (Mat3, Mat3): lambda a, b: Mat3(a.x - b.x, a.y - b.y, a.z - b.z),
+        (Vec6, Vec6): lambda a, b: Vec6(a.a - b.a, a.b - b.b),
+        (Mat6, Mat6): lambda a, b: Mat6(a.a - b.a, a.b - b.b, a.c - b.c, a.d - b.d),
+    },
+    "mul": {
+        (float, Vec3): lambda a, b: Vec3(a * b.x, a * b.y, a * b.z),
+        (float, Mat3): lambda a, b: Mat3(a * b.x, a * b.y, a * b.z),
+        (float, Vec6): lambda a, b: Vec6(a * b.a, a * b.b),
+        (float, Mat6): lambda a, b: Mat6(a * b.a, a * b.b, a * b.c, a * b.d),
+    },
+    "matmul": {
+        (Vec3, Vec3): lambda a, b: a.x * b.x + a.y * b.y + a.z * b.z,
+        (Mat3, Vec3): lambda a, b: Vec3(a.x @ b, a.y @ b, a.z @ b),
+        (Mat3, Mat3): lambda a, b: Mat3(b.T @ a.x, b.T @ a.y, b.T @ a.z),
+        (Mat3, Skew): lambda a, b: Mat3(cross(a.x, b.v), cross(a.y, b.v), cross(a.z, b.v)),
+        (Skew, Vec3): lambda a, b: cross(a.v, b),
+        (Skew, Mat3): lambda a, b: Mat3(cross(a.v, b.T.x), cross(a.v, b.T.y), cross(a.v, b.T.z)).T,
+        (Vec6, Vec6): lambda a, b: a.a @ b.a + a.b @ b.b,
+        (Mat6, Vec6): lambda a, b: Vec6(a.a @ b.a + a.b @ b.b, a.c @ b.a + a.d @ b.b),
+        (Mat6, Mat6): lambda a, b: Mat6(
+            a.a @ b.a + a.b @ b.c, a.a @ b.b + a.b @ b.d, a.c @ b.a + a.d @ b.c, a.c @ b.b + a.d @ b.d
+        ),
+    },
+}
+"""Operators by the kinds of both operands; the first that fits counts."""
+TRANSPOSES: dict[type, Callable[[Any], Any]] = {
+    Mat3: lambda a: Mat3(Vec3(a.x.x, a.y.x, a.z.x), Vec3(a.x.y, a.y.y, a.z.y), Vec3(a.x.z, a.y.z, a.z.z)),
+    Mat6: lambda a: Mat6(a.a.T, a.c.T, a.b.T, a.d.T),
+}
+
+
+def _applied(name: str, a: Any, b: Any) -> Any:
+    kinds = (float if isinstance(a, float | int | np.number) else type(a)), type(b)
+    return RULES[name][kinds](a, b) if kinds in RULES[name] else NotImplemented
+
+
+def _compiled_kind(t: types.Type) -> Any:
+    return float if isinstance(t, types.Float | types.Integer) else getattr(t, "instance_class", None)
+
+
+def _install(name: str, op: Callable[..., Any]) -> None:
+    """Give an operator to compiled code, inlined: tuples stay in registers only within one function."""
+
+    def rule(a: Any, b: Any) -> Rule | None:
+        return RULES[name].get((_compiled_kind(a), _compiled_kind(b)))
+
+    extending.overload(op, jit_options=INLINE, strict=False)(rule)
+
+
+INLINE: Any = {"forceinline": True, "error_model": "numpy"}
+for _op in (operator.add, operator.iadd, operator.sub, operator.isub, operator.mul, operator.matmul):
+    _install(_op.__name__.lstrip("i"), _op)
+
+
+def _transpose(a: Any) -> Callable[[Any], Any] | None:
+    return TRANSPOSES.get(_compiled_kind(a))
+
+
+extending.overload_attribute(types.NamedUniTuple, "T", jit_options=INLINE, strict=False)(_transpose)
+
+
+ZERO = Vec3(0.0, 0.0, 0.0)
+O3 = Mat3(ZERO, ZERO, ZERO)
+I3 = Mat3(Vec3(1.0, 0.0, 0.0), Vec3(0.0, 1.0, 0.0), Vec3(0.0, 0.0, 1.0))
+O6 = Mat6(O3, O3, O3, O3)
+
+
+@inlined
+def cross(a: Vec3, b: Vec3) -> Vec3:
+    """``a x b``."""
+    return Vec3(a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x)
+
+
+@inlined
+def skew(v: Vec3) -> Skew:
+    """``[v]x``; ``I3 @ skew(v)`` has it as a `Mat3`."""
+    return Skew(v)
+
+
+@inlined
+def diagonal(v: Vec3) -> Mat3:
+    """``diag(v)``."""
+    return Mat3(Vec3(v.x, 0.0, 0.0), Vec3(0.0, v.y, 0.0), Vec3(0.0, 0.0, v.z))
+
+
+@inlined
+def vec(a: Any) -> Vec3:
+    """Vector from the first three numbers of an array or tuple."""
+    return Vec3(a[0], a[1], a[2])
+
+
+@inlined
+def mat(A: Any) -> Mat3:
+    """Matrix from the first three rows and columns of an array."""
+    return Mat3(Vec3(A[0, 0], A[0, 1], A[0, 2]), Vec3(A[1, 0], A[1, 1], A[1, 2]), Vec3(A[2, 0], A[2, 1], A[2, 2]))
+
+
+@inlined
+def block(A: Floats, row: int, column: int) -> Mat3:
+    """3 × 3 block of an array, its first element at (row, column)."""
+    r, c = row, column
+    return Mat3(
+        Vec3(A[r, c], A[r, c + 1], A[r, c + 2]),
+        Vec3(A[r + 1, c], A[r + 1, c + 1], A[r + 1, c + 2]),
+        Vec3(A[r + 2, c], A[r + 2, c + 1], A[r + 2, c + 2]),
+    )
+
+
+@inlined
+def mat6(A: Floats) -> Mat6:
+    """Matrix from the first six rows and columns of an array."""
+    return Mat6(block(A, 0, 0), block(A, 0, 3), block(A, 3, 0), block(A, 3, 3))
+
+
+@inlined
+def store(A: Mat3, out: Floats, row: int, column: int) -> None:
+    """Write a matrix into an array, its first element at (row, column)."""
+    r, c = row, column
+    out[r, c], out[r, c + 1], out[r, c + 2] = A.x.x, A.x.y, A.x.z
+    out[r + 1, c], out[r + 1, c + 1], out[r + 1, c + 2] = A.y.x, A.y.y, A.y.z
+    out[r + 2, c], out[r + 2, c + 1], out[r + 2, c + 2] = A.z.x, A.z.y, A.z.z
+
+
+@inlined
+def store6(A: Mat6, out: Floats) -> None:
+    """Write a symmetric matrix into the first six rows and columns of an array, symmetric to the last bit."""
+    store(0.5 * (A.a + A.a.T), out, 0, 0)
+    store(A.c.T, out, 0, 3)
+    store(A.c, out, 3, 0)
+    store(0.5 * (A.d + A.d.T), out, 3, 3)
+
+
+@inlined
+def adjoint(R: Mat3, p: Vec3) -> Mat6:
+    """Ad of a pose, on [rotation, translation]: ``[[R, 0], [[p]x R, R]]``."""
+    return Mat6(R, O3, skew(p) @ R, R)
+
+
+@inlined
+def inverse_adjoint(R: Mat3, p: Vec3) -> Mat6:
+    """Ad of the inverse of a pose: ``[[R^T, 0], [-R^T [p]x, R^T]]``."""
+    return Mat6(R.T, O3, -1.0 * (R.T @ skew(p)), R.T)
+
+
+@inlined
+def exp_and_mean(phi: Vec3) -> tuple[Mat3, Mat3]:
+    """``Exp(phi)`` and ``J_l(phi)``, the mean of ``Exp(s phi)`` over s in [0, 1]; by series below 0.05 rad."""
+    x = phi @ phi
+    if x < 2.5e-3:
+        a = 1.0 - x * (1.0 / 6.0 - x * (1.0 / 120.0 - x / 5040.0))
+        b = 0.5 - x * (1.0 / 24.0 - x * (1.0 / 720.0 - x / 40320.0))
+        c = 1.0 / 6.0 - x * (1.0 / 120.0 - x * (1.0 / 5040.0 - x / 362880.0))
+    else:
+        angle = math.sqrt(x)
+        a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / x
+        c = (1.0 - a) / x
+    return rodrigues(phi, x, a, b), rodrigues(phi, x, b, c)
+
+
+@inlined
+def rodrigues(phi: Vec3, x: float, a: float, b: float) -> Mat3:
+    """``I + a [phi]x + b [phi]x^2``, with ``[phi]x^2 = phi phi^T - x I`` and ``x = |phi|^2``."""
+    p, q, r, d = phi.x, phi.y, phi.z, 1.0 - b * x
+    return Mat3(
+        Vec3(d + b * p * p, b * p * q - a * r, b * p * r + a * q),
+        Vec3(b * q * p + a * r, d + b * q * q, b * q * r - a * p),
+        Vec3(b * r * p - a * q, b * r * q + a * p, d + b * r * r),
+    )
+
+
+@inlined
+def rotation_from_euler(angles: Vec3) -> Mat3:
+    """world_R_body from (phi, theta, psi), rad."""
+    c_r, s_r = math.cos(angles.x), math.sin(angles.x)
+    c_p, s_p = math.cos(angles.y), math.sin(angles.y)
+    c_y, s_y = math.cos(angles.z), math.sin(angles.z)
+    return Mat3(
+        Vec3(c_y * c_p, c_y * s_p * s_r - s_y * c_r, c_y * s_p * c_r + s_y * s_r),
+        Vec3(s_y * c_p, s_y * s_p * s_r + c_y * c_r, s_y * s_p * c_r - c_y * s_r),
+        Vec3(-s_p, c_p * s_r, c_p * c_r),
+    )
+
+
+@inlined
+def euler_from_rotation(R: Mat3) -> Vec3:
+    """(phi, theta, psi), rad; phi and psi in (-pi, pi], theta in [-pi/2, pi/2]."""
+    return Vec3(math.atan2(R.z.y, R.z.z), math.atan2(-R.z.x, math.hypot(R.z.y, R.z.z)), math.atan2(R.y.x, R.x.x))
+
+
+@inlined
+def body_rates_from_euler(angles: Vec3) -> Mat3:
+    """W of the module's docstring."""
+    c_r, s_r, c_p, s_p = math.cos(angles.x), math.sin(angles.x), math.cos(angles.y), math.sin(angles.y)
+    return Mat3(Vec3(1.0, 0.0, -s_p), Vec3(0.0, c_r, s_r * c_p), Vec3(0.0, -s_r, c_r * c_p))
+
+
+@inlined
+def euler_rates_from_body(angles: Vec3) -> Mat3:
+    """E of the module's docstring."""
+    c_r, s_r, c_p, t_p = math.cos(angles.x), math.sin(angles.x), math.cos(angles.y), math.tan(angles.y)
+    return Mat3(Vec3(1.0, s_r * t_p, c_r * t_p), Vec3(0.0, c_r, -s_r), Vec3(0.0, s_r / c_p, c_r / c_p))
