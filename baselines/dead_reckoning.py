@@ -5,12 +5,20 @@ from typing import ClassVar
 import numpy as np
 
 from sonar_graph.calibration import Calibration, Section
-from sonar_graph.estimator import CausalEstimates
 from sonar_graph.measurements import Floats, Measurements
 from sonar_graph.navigation import Odometry, PreintegratedMotion, motion_between_nodes, motion_since_node
 from sonar_graph.navigation.alignment import earth_rate_in_world
 from sonar_graph.navigation.preintegration import Preintegrator
-from sonar_graph.states import DetectionJournal, DetectionLog, Estimate, LandmarkMap, Outcome, RefusedRow, Trajectory
+from sonar_graph.states import (
+    CausalEstimates,
+    DetectionJournal,
+    DetectionLog,
+    Estimate,
+    LandmarkMap,
+    Outcome,
+    RefusedRow,
+    Trajectory,
+)
 
 
 class DeadReckoningParams(Section):

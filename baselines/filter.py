@@ -21,11 +21,19 @@ from baselines.filter_window import (
 from baselines.sonar_update import GATED, NEW, NO_SLOT, USED, DetectionColumns, DetectionOutcomes, sonar_model
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import MeasurementError
-from sonar_graph.estimator import CausalEstimates
 from sonar_graph.measurements import Depth, Floats, Ints, LandmarkDetections, Measurements
 from sonar_graph.navigation import Odometry
 from sonar_graph.slam.landmarks import identify
-from sonar_graph.states import DetectionJournal, DetectionLog, Estimate, LandmarkMap, Outcome, RefusedRow, Trajectory
+from sonar_graph.states import (
+    CausalEstimates,
+    DetectionJournal,
+    DetectionLog,
+    Estimate,
+    LandmarkMap,
+    Outcome,
+    RefusedRow,
+    Trajectory,
+)
 
 OUTCOMES = {USED: Outcome.USED, NEW: Outcome.NEW, GATED: Outcome.GATED}
 NO_STAMPS = np.empty(0, np.int64)

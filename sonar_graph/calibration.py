@@ -11,10 +11,11 @@ from typing import Annotated, Any, Literal
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic.fields import FieldInfo
+from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from sonar_graph.errors import CalibrationError
-from sonar_graph.settings import faults_in
+from sonar_graph.errors import MISFIT
 
 STANDARD_GRAVITY = 9.80665
 HOLE_INTERVALS = 5
@@ -50,6 +51,32 @@ class Section(BaseModel):
     """A frozen group of settings that refuses names it does not know."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+
+def tagged(tag: str, default: str) -> tuple[FieldInfo, BeforeValidator]:
+    """Metadata of a union of sections that one of their fields tells apart; it has a default.
+
+    ``tag``: that field, with a literal text in each section; ``default``: its value where it is not given.
+    """
+
+    def with_tag(value: Any) -> Any:
+        if isinstance(value, str):
+            raise ValueError(f'expected a section with {tag} = "{value}"')
+        return {tag: default, **value} if isinstance(value, dict) else value
+
+    return Field(discriminator=tag), BeforeValidator(with_tag)
+
+
+def misfits(model: type[BaseModel], reasons: dict[str, str]) -> ValidationError:
+    """Error for a model's validator to raise where fields exclude each other.
+
+    ``reasons``: message for each field, so that the line in a file can be named.
+    """
+    found = [
+        InitErrorDetails(type=PydanticCustomError(MISFIT, "{reason}", {"reason": reason}), loc=(name,), input=None)
+        for name, reason in reasons.items()
+    ]
+    return ValidationError.from_exception_data(model.__name__, found)
 
 
 class Mounting(Section):
@@ -186,10 +213,6 @@ class Calibration(Section):
     >>> calibration = Calibration(imu=ImuCalibration(gyro_bias_sigma=1e-4), floor=FloorPrior(z_m=-1.7, sigma_m=0.02))
     >>> calibration.dvl.mounting.pose().translation()
     array([0., 0., 0.])
-    >>> Calibration.parse({"imu": {"gyro_bias": 1e-4}}, "vehicle.toml")
-    Traceback (most recent call last):
-        ...
-    sonar_graph.errors.CalibrationError: vehicle.toml: imu.gyro_bias: there is no such field; ...
     """
 
     imu: ImuCalibration = ImuCalibration()
@@ -213,17 +236,3 @@ class Calibration(Section):
         Annotated[Number, within(-np.pi / 2, np.pi / 2, "radians between -π/2 and π/2 (48° are 0.838)")] | None
     ) = None
     """Latitude for removing the Earth's rotation from the gyros (world x east, y north); None: not removed."""
-
-    @classmethod
-    def parse(cls, values: object, source: str) -> Calibration:
-        """Validate plain values (from TOML or JSON); ``source`` names their origin in the error.
-
-        Raises
-        ------
-        CalibrationError
-            Naming the source, each wrong field, what was expected, and the fields that exist.
-        """
-        try:
-            return cls.model_validate(values)
-        except ValidationError as error:
-            raise CalibrationError(f"{source}: {faults_in(error, cls)}") from error

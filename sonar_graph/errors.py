@@ -4,6 +4,9 @@ Each message says what was asked, what was found, and what to do. The command li
 with 2; only an unforeseen error ends in a traceback.
 """
 
+MISFIT = "misfit"
+"""Type of a validation error whose message alone says all."""
+
 
 class SonarGraphError(Exception):
     """Root of every error that this package raises on purpose."""

@@ -12,12 +12,10 @@ It then takes part in ``sonar-graph compare`` under that name. `sonar_graph.test
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
-from pydantic import ValidationError
-
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.errors import EstimatorError, UnknownEstimatorError
 from sonar_graph.measurements import Measurements
-from sonar_graph.settings import faults_in, nested, suggestion
+from sonar_graph.settings import nested, parse, suggestion
 from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, RefusedRow, Trajectory
 
 ENTRY_POINT_GROUP = "sonar_graph.estimators"
@@ -138,26 +136,4 @@ def make_params(estimator: type[Estimator], overrides: dict[str, Any], name: str
     nested, ``{"identity": {"policy": "gate"}}``. Raises `EstimatorError` naming the setting that does not exist or does
     not fit, and those that exist.
     """
-    try:
-        return estimator.Params.model_validate(nested(overrides))
-    except ValidationError as error:
-        raise EstimatorError(f"settings of {name}: {faults_in(error, estimator.Params)}") from error
-
-
-class CausalEstimates:
-    """Causal estimates of a filter in order of time, one an instant."""
-
-    def __init__(self) -> None:
-        self._estimates: list[Estimate] = []
-
-    def keep(self, estimate: Estimate) -> None:
-        """Append an estimate; one for the same instant replaces the last, an earlier one is ignored."""
-        last_ns = self._estimates[-1].stamp_ns if self._estimates else None
-        if last_ns is None or estimate.stamp_ns > last_ns:
-            self._estimates.append(estimate)
-        elif estimate.stamp_ns == last_ns:
-            self._estimates[-1] = estimate
-
-    def trajectory(self) -> Trajectory:
-        """Trajectory through all estimates."""
-        return Trajectory.from_estimates(self._estimates)
+    return parse(estimator.Params, nested(overrides), f"settings of {name}", EstimatorError)

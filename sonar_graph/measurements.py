@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 from sonar_graph.errors import MeasurementError
 
+NS_PER_S = 1_000_000_000
+"""Stamps are whole nanoseconds."""
 ROUNDING = 1e-6
 """Tolerance of a sum of posteriors above 1: single precision."""
 FIRST_TOO_LARGE_ID = 2**56

@@ -7,10 +7,8 @@ import numpy as np
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import MeasurementError
-from sonar_graph.measurements import Depth, Dvl, Imu, Ints, LandmarkDetections, Measurements
+from sonar_graph.measurements import NS_PER_S, Depth, Dvl, Imu, Ints, LandmarkDetections, Measurements
 from sonar_graph.states import LandmarkMap, Trajectory
-
-NS_PER_S = 1_000_000_000
 
 
 @dataclass(frozen=True, eq=False, repr=False)

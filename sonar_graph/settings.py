@@ -5,30 +5,17 @@ from copy import deepcopy
 from difflib import SequenceMatcher
 from functools import partial
 from types import UnionType
-from typing import Any, NamedTuple, Union, get_args, get_origin
+from typing import Any, NamedTuple, TypeVar, Union, get_args, get_origin
 
-from pydantic import BaseModel, BeforeValidator, Field, ValidationError
-from pydantic.fields import FieldInfo
-from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+from sonar_graph.errors import MISFIT, CalibrationError
 
 Place = tuple[int | str, ...]
 _SHOWN_CHARACTERS = 60
 _LEAST_SIMILARITY = 0.7
-_MISFIT = "misfit"
-
-
-def tagged(tag: str, default: str) -> tuple[FieldInfo, BeforeValidator]:
-    """Metadata of a union of sections that one of their fields tells apart; it has a default.
-
-    ``tag``: that field, with a literal text in each section; ``default``: its value where it is not given.
-    """
-
-    def with_tag(value: Any) -> Any:
-        if isinstance(value, str):
-            raise ValueError(f'expected a section with {tag} = "{value}"')
-        return {tag: default, **value} if isinstance(value, dict) else value
-
-    return Field(discriminator=tag), BeforeValidator(with_tag)
+M = TypeVar("M", bound=BaseModel)
 
 
 def nested(values: dict[str, Any], start: dict[str, Any] | None = None) -> dict[str, Any]:
@@ -90,6 +77,30 @@ def settings_of(model: type[BaseModel], default: BaseModel | None = None, sectio
     return list(found.values())
 
 
+def parse(model: type[M], values: object, source: str, refusal: type[Exception] = CalibrationError) -> M:
+    """Plain values, such as from TOML or JSON, as their model.
+
+    Parameters
+    ----------
+    source
+        Origin of the values, with which the message begins.
+    refusal
+        Error for wrong values: it names each wrong field, what was expected, and the fields that exist.
+
+    Examples
+    --------
+    >>> from sonar_graph import Calibration
+    >>> parse(Calibration, {"imu": {"gyro_bias": 1e-4}}, "vehicle.toml")
+    Traceback (most recent call last):
+        ...
+    sonar_graph.errors.CalibrationError: vehicle.toml: imu.gyro_bias: there is no such field; ...
+    """
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        raise refusal(f"{source}: {faults_in(error, model)}") from error
+
+
 def faults_in(error: ValidationError, model: type[BaseModel]) -> str:
     """Message naming every wrong field and the expected value, in one line.
 
@@ -105,21 +116,9 @@ def faults_in(error: ValidationError, model: type[BaseModel]) -> str:
     return "; ".join(texts)
 
 
-def misfits(model: type[BaseModel], reasons: dict[str, str]) -> ValidationError:
-    """Error for a model's validator to raise where fields exclude each other.
-
-    ``reasons``: message for each field, so that the line in a file can be named.
-    """
-    found = [
-        InitErrorDetails(type=PydanticCustomError(_MISFIT, "{reason}", {"reason": reason}), loc=(name,), input=None)
-        for name, reason in reasons.items()
-    ]
-    return ValidationError.from_exception_data(model.__name__, found)
-
-
 def _describe(error: ErrorDetails, model: type[BaseModel]) -> str:
     place = error["loc"]
-    if error["type"] == _MISFIT:
+    if error["type"] == MISFIT:
         return error["msg"]
     if error["type"] == "extra_forbidden":
         return unknown_field(place, model)

@@ -136,6 +136,25 @@ class Trajectory:
         return Trajectory.without_covariances(stamps_ns, positions, quaternions)
 
 
+class CausalEstimates:
+    """Causal estimates of a filter in order of time, one an instant."""
+
+    def __init__(self) -> None:
+        self._estimates: list[Estimate] = []
+
+    def keep(self, estimate: Estimate) -> None:
+        """Append an estimate; one for the same instant replaces the last, an earlier one is ignored."""
+        last_ns = self._estimates[-1].stamp_ns if self._estimates else None
+        if last_ns is None or estimate.stamp_ns > last_ns:
+            self._estimates.append(estimate)
+        elif estimate.stamp_ns == last_ns:
+            self._estimates[-1] = estimate
+
+    def trajectory(self) -> Trajectory:
+        """Trajectory through all estimates."""
+        return Trajectory.from_estimates(self._estimates)
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class LandmarkMap:
     """Positions of landmarks, with their covariances, by identity.

@@ -9,8 +9,8 @@ from baselines.ekf_slam import EkfSlam, EkfSlamParams
 from baselines.invariant_ekf import InvariantEkf, InvariantEkfParams
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting, Start
 from sonar_graph.estimator import Estimator
-from sonar_graph.measurements import Dvl, Floats, Imu
-from sonar_graph.sequence import NS_PER_S, Sequence
+from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu
+from sonar_graph.sequence import Sequence
 from sonar_graph.slam import GaussianKernel, Isam2, Isam2Params, KeyframeParams, SmootherParams
 from sonar_graph.states import Estimate
 

@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration, Mounting, SonarImage, Start
 from sonar_graph.errors import CalibrationError
+from sonar_graph.settings import parse
 
 angles = st.floats(-3, 3)
 lengths = st.floats(-5, 5)
@@ -31,12 +32,14 @@ def test_sonar_pitched_down_looks_at_the_floor():
 
 
 def test_calibration_survives_json():
-    calibration = Calibration.parse({"imu": {"gyro_noise_density": 1 / 3}, "floor": {"z_m": -1.7, "sigma_m": 0.1}}, "x")
+    calibration = parse(
+        Calibration, {"imu": {"gyro_noise_density": 1 / 3}, "floor": {"z_m": -1.7, "sigma_m": 0.1}}, "x"
+    )
     assert Calibration.model_validate_json(calibration.model_dump_json()) == calibration
 
 
 def test_empty_calibration_is_usable():
-    assert Calibration.parse({}, "x") == Calibration()
+    assert parse(Calibration, {}, "x") == Calibration()
 
 
 @pytest.mark.parametrize(
@@ -52,7 +55,7 @@ def test_empty_calibration_is_usable():
 )
 def test_wrong_field_is_refused_by_source_and_name(values, field):
     with pytest.raises(CalibrationError) as refusal:
-        Calibration.parse(values, "vehicle.toml")
+        parse(Calibration, values, "vehicle.toml")
     message = str(refusal.value)
     assert message.startswith("vehicle.toml: ")
     assert field in message
@@ -81,19 +84,19 @@ def test_wrong_field_is_refused_by_source_and_name(values, field):
 )
 def test_a_number_that_nothing_can_have_is_refused(values, message):
     with pytest.raises(CalibrationError) as refusal:
-        Calibration.parse(values, "vehicle.toml")
+        parse(Calibration, values, "vehicle.toml")
     assert message in str(refusal.value)
 
 
 def test_numbers_at_the_edge_of_what_can_be_are_taken():
     exact = {"start": {"rpy_sigma_rad": [0, 0, 0], "rpy_rad": [0, 0, -2 * np.pi]}, "imu": {"gyro_noise_density": 0}}
     at_pole = {"earth_rate_latitude_rad": -np.pi / 2, "gravity_m_s2": 9.832}
-    assert Calibration.parse(exact | at_pole, "x").gravity_m_s2 == 9.832
+    assert parse(Calibration, exact | at_pole, "x").gravity_m_s2 == 9.832
 
 
 def test_every_wrong_field_is_named_at_once():
     with pytest.raises(CalibrationError, match=r"gravity_m_s2.*nonsense"):
-        Calibration.parse({"gravity_m_s2": -1, "nonsense": 1}, "x")
+        parse(Calibration, {"gravity_m_s2": -1, "nonsense": 1}, "x")
 
 
 def test_calibration_cannot_be_changed():

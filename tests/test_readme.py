@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from sonar_graph.calibration import Calibration
+from sonar_graph.settings import parse
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -33,7 +34,7 @@ def test_links_between_pages_lead_somewhere(page: Path) -> None:
 
 def test_example_calibration_is_one() -> None:
     example = next(block for block in blocks("toml") if "[imu]" in block)
-    parsed = Calibration.parse(tomllib.loads(example), "README.md")
+    parsed = parse(Calibration, tomllib.loads(example), "README.md")
     assert parsed.dvl.mounting.translation_m == (0.30, 0.0, -0.15)
 
 

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import MeasurementError
-from sonar_graph.measurements import Depth, Dvl, Imu
-from sonar_graph.sequence import NS_PER_S, Sequence
+from sonar_graph.measurements import NS_PER_S, Depth, Dvl, Imu
+from sonar_graph.sequence import Sequence
 
 
 def recording(imu_s: tuple[float, float] = (0.0, 10.0), dvl_s: tuple[float, float] = (0.0, 10.0)) -> Sequence:

@@ -35,8 +35,8 @@ import numpy as np
 
 from baselines.ekf_slam import EkfSlam
 from baselines.invariant_ekf import InvariantEkf
-from sonar_graph.measurements import Floats, Measurements
-from sonar_graph.sequence import NS_PER_S, Sequence
+from sonar_graph.measurements import NS_PER_S, Floats, Measurements
+from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
 
 FULL_S, QUICK_S = 2040.0, 120.0

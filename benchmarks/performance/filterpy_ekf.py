@@ -16,11 +16,11 @@ import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.measurements import Floats
+from sonar_graph.measurements import NS_PER_S, Floats
 from sonar_graph.navigation import Odometry, PreintegratedMotion
 from sonar_graph.navigation.alignment import gravity_direction, velocity_at_imu
 from sonar_graph.navigation.preintegration import Preintegrator, Steps
-from sonar_graph.sequence import NS_PER_S, Sequence
+from sonar_graph.sequence import Sequence
 from sonar_graph.slam.landmarks import gate_threshold, identify
 from sonar_graph.slam.models import FLOOR_GATE, elevation_on_floor, locate_jacobians, range_azimuth_jacobians
 

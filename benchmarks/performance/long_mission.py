@@ -34,8 +34,8 @@ sys.path.append(str(Path(__file__).resolve().parents[1]))
 from common import conclude, make_parser, note, print_table
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.measurements import Block, Depth, Dvl, Imu, LandmarkDetections, Measurements
-from sonar_graph.sequence import NS_PER_S, Sequence
+from sonar_graph.measurements import NS_PER_S, Block, Depth, Dvl, Imu, LandmarkDetections, Measurements
+from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
 from sonar_graph.slam import BoundedHistory, Isam2, Isam2Params, WholeHistory
 from sonar_graph.states import Estimate

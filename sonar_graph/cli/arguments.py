@@ -236,14 +236,9 @@ def estimator_settings(texts: list[str] | None, names: list[str]) -> dict[str, d
 
 def validated(kind: type[Model], values: dict[str, Any], whose: str) -> Model:
     """Settings as their model."""
-    from pydantic import ValidationError
+    from sonar_graph.settings import parse
 
-    from sonar_graph.settings import faults_in
-
-    try:
-        return kind.model_validate(values)
-    except ValidationError as error:
-        raise typer.BadParameter(f"settings of the {whose}: {faults_in(error, kind)}") from error
+    return parse(kind, values, f"settings of the {whose}", typer.BadParameter)
 
 
 def examples(*commands: str) -> str:

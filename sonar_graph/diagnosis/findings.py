@@ -13,7 +13,7 @@ import numpy as np
 
 from sonar_graph.calibration import Calibration, ImuCalibration, Start
 from sonar_graph.errors import AlignmentError
-from sonar_graph.measurements import Dvl, Floats, Imu
+from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu
 from sonar_graph.navigation.alignment import (
     LONGEST_S,
     DvlMatch,
@@ -24,7 +24,7 @@ from sonar_graph.navigation.alignment import (
     align_in_motion,
     until_hole,
 )
-from sonar_graph.sequence import NS_PER_S, Sequence
+from sonar_graph.sequence import Sequence
 from sonar_graph.states import Trajectory
 
 INTERVAL_SIGMAS = 1.96

@@ -31,7 +31,7 @@ from sonar_graph.diagnosis.findings import (
     with_fitted,
 )
 from sonar_graph.logs.adapters import LogConfig
-from sonar_graph.measurements import Dvl, Floats, Imu
+from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu
 from sonar_graph.navigation.alignment import (
     DvlMatch,
     Estimate1D,
@@ -41,7 +41,7 @@ from sonar_graph.navigation.alignment import (
     match_reference_to_imu,
     noise_densities,
 )
-from sonar_graph.sequence import NS_PER_S, Sequence
+from sonar_graph.sequence import Sequence
 
 FASTEST_M_S = 20.0
 """Implausible over the bottom for a twentieth of a log."""

@@ -13,8 +13,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from sonar_graph.errors import EvaluationError
-from sonar_graph.measurements import Floats, Ints
-from sonar_graph.sequence import NS_PER_S
+from sonar_graph.measurements import NS_PER_S, Floats, Ints
 from sonar_graph.states import FIRST_ANONYMOUS_ID, LandmarkMap, Trajectory
 
 PAIRING_TOLERANCE = 0.01

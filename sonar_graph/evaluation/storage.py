@@ -36,6 +36,7 @@ from sonar_graph.logs.mcap import Attachment
 from sonar_graph.measurements import Dvl, Imu, LandmarkDetections
 from sonar_graph.recognition import read_recognition, write_recognition
 from sonar_graph.sequence import Sequence
+from sonar_graph.settings import parse
 from sonar_graph.states import DetectionLog, LandmarkMap, Outcome, Refusal, RefusedRow, Trajectory
 
 Arrays = dict[str, np.ndarray]
@@ -215,7 +216,7 @@ def _restore(index: dict[str, Any], folder: Path) -> Comparison:
             series = {kind: _unpack(f"errors.{kind}", ErrorSeries, arrays) for kind in KINDS}
             errors[name] = {kind: known for kind, known in series.items() if known is not None}
     arrays, entry = _read_arrays(folder / SEQUENCE), index["sequence"]
-    calibration = Calibration.parse(entry["calibration"], str(folder / INDEX))
+    calibration = parse(Calibration, entry["calibration"], str(folder / INDEX))
     return Comparison(
         sequence=_restore_sequence(entry["name"], calibration, entry["notes"], arrays),
         instants_ns=arrays["instants_ns"],

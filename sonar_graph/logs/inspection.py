@@ -19,8 +19,7 @@ from sonar_graph.logs.mcap import STAMP_BYTES, Keep, Recording, TimeWindow, Topi
 from sonar_graph.logs.reading import Assembly, describe_frames, read_sonar_frames
 from sonar_graph.logs.roles import ROLES, SEQUENCE_ROLES, SONAR, TF, Choice, choose_topic, refusal, wanted_types
 from sonar_graph.logs.vehicle_setup import read_calibration, read_notes, recorded_name, static_frames
-from sonar_graph.measurements import Ints
-from sonar_graph.sequence import NS_PER_S
+from sonar_graph.measurements import NS_PER_S, Ints
 
 _MOST_FIELDS = 24
 _MOST_FRAMES = 6

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from sonar_graph.errors import LogError
-from sonar_graph.sequence import NS_PER_S
+from sonar_graph.measurements import NS_PER_S
 from sonar_graph.states import LandmarkMap, Trajectory
 
 LANDMARK_COLUMNS = ("id", "x_m", "y_m", "z_m", "cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz")

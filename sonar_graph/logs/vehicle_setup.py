@@ -23,7 +23,7 @@ from sonar_graph.errors import CalibrationError, LogError
 from sonar_graph.logs.cdr import Bytes, Value, definition, encode, parse_definition, short_name
 from sonar_graph.logs.mcap import Keep, Recording, scan
 from sonar_graph.logs.roles import TF
-from sonar_graph.settings import faults_in
+from sonar_graph.settings import faults_in, parse
 
 METADATA = "sonar_graph"
 """Name of the metadata record with name, calibration and notes."""
@@ -148,7 +148,7 @@ def gathered(
         values = _over(values, recorded.model_dump(exclude_unset=True))
     if given is None:
         return Calibration.model_validate(values)
-    return Calibration.parse(_over(values, given.values), given.source)
+    return parse(Calibration, _over(values, given.values), given.source)
 
 
 def mounted_by(values: Values) -> set[str]:
@@ -189,7 +189,7 @@ def read_calibration(recording: Recording) -> Calibration | None:
     text = recording.metadata.get(METADATA, {}).get("calibration")
     if text is None:
         return None
-    return Calibration.parse(_json(recording, "calibration", text), f"{recording.path}: metadata record {METADATA!r}")
+    return parse(Calibration, _json(recording, "calibration", text), f"{recording.path}: metadata record {METADATA!r}")
 
 
 def read_notes(recording: Recording) -> dict[str, str]:

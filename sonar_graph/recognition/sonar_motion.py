@@ -6,11 +6,11 @@ depth and the calibration's floor. Nothing stamped after a frame is used for it.
 
 import numpy as np
 
-from sonar_graph.measurements import Depth, Floats
+from sonar_graph.measurements import NS_PER_S, Depth, Floats
 from sonar_graph.navigation import Odometry, PreintegratedMotion, motion_between, motion_between_nodes
 from sonar_graph.navigation.alignment import gravity_direction, velocity_at_imu
 from sonar_graph.navigation.preintegration import Preintegrator
-from sonar_graph.sequence import NS_PER_S, Sequence
+from sonar_graph.sequence import Sequence
 from sonar_graph.sonar import FloorView, SonarStep
 
 GRAVITY_INTERVAL_NS = NS_PER_S

@@ -14,7 +14,8 @@ from pydantic import Field
 
 from sonar_graph.calibration import Mounting, Section, SonarCalibration
 from sonar_graph.errors import SimulationError
-from sonar_graph.sequence import NS_PER_S, Sequence
+from sonar_graph.measurements import NS_PER_S
+from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.detections import FieldOfView, SimulatedRecogniser, World, simulate_detections
 from sonar_graph.simulation.sensors import EPOCH_NS, regular_stamps
 from sonar_graph.simulation.vehicle import VehiclePath, rpy_from_rotation

@@ -8,8 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import DepthCalibration, DvlCalibration, ImuCalibration, Mounting
-from sonar_graph.measurements import Depth, Dvl, Floats, Imu, Ints
-from sonar_graph.sequence import NS_PER_S
+from sonar_graph.measurements import NS_PER_S, Depth, Dvl, Floats, Imu, Ints
 from sonar_graph.simulation.vehicle import Kinematics, VehiclePath, rotation_from_rpy
 
 EPOCH_NS = 1_400_000_000 * NS_PER_S

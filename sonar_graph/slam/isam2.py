@@ -17,11 +17,9 @@ import numpy as np
 from gtsam.symbol_shorthand import L
 from pydantic import BaseModel, model_validator
 
-from sonar_graph.calibration import Calibration, Section
+from sonar_graph.calibration import Calibration, Section, misfits
 from sonar_graph.errors import CalibrationError, EstimatorError
-from sonar_graph.measurements import Floats, Ints, Measurements
-from sonar_graph.sequence import NS_PER_S
-from sonar_graph.settings import misfits
+from sonar_graph.measurements import NS_PER_S, Floats, Ints, Measurements
 from sonar_graph.slam.estimates import AnchoredPose, Over, PoseHistory, joint_covariance
 from sonar_graph.slam.frontend import Sightings
 from sonar_graph.slam.keyframes import KeyframeParams, Keyframes

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration, ImuCalibration, Start
-from sonar_graph.measurements import Block, Depth, Dvl, Floats, Imu, Ints, LandmarkDetections
-from sonar_graph.sequence import NS_PER_S, Sequence
+from sonar_graph.measurements import NS_PER_S, Block, Depth, Dvl, Floats, Imu, Ints, LandmarkDetections
+from sonar_graph.sequence import Sequence
 from sonar_graph.states import LandmarkMap, Trajectory
 
 START_NS = 1_700_000_000 * NS_PER_S

@@ -24,8 +24,8 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.estimator import Estimator
-from sonar_graph.measurements import Floats, Ints
-from sonar_graph.sequence import NS_PER_S, Sequence
+from sonar_graph.measurements import NS_PER_S, Floats, Ints
+from sonar_graph.sequence import Sequence
 from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Trajectory
 from sonar_graph.testing.drives import (
     DURATION_S,

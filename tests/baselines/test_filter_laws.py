@@ -27,12 +27,11 @@ from sonar_graph.calibration import (
     Start,
 )
 from sonar_graph.errors import EstimatorError, MeasurementError
-from sonar_graph.estimator import CausalEstimates
 from sonar_graph.evaluation.consistency import yaw_variances
-from sonar_graph.measurements import Depth, Dvl, Imu, LandmarkDetections, Measurements
-from sonar_graph.sequence import NS_PER_S, Sequence
+from sonar_graph.measurements import NS_PER_S, Depth, Dvl, Imu, LandmarkDetections, Measurements
+from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
-from sonar_graph.states import Estimate, Outcome
+from sonar_graph.states import CausalEstimates, Estimate, Outcome
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks" / "performance"
 T0_NS = 1_700_000_000 * NS_PER_S

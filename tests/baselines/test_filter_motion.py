@@ -18,7 +18,7 @@ from baselines.filter_motion import (
 )
 from baselines.filter_window import NODE, OPENED, GravityInterval, VehicleModel, vehicle_model
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
-from sonar_graph.measurements import Dvl, Imu
+from sonar_graph.measurements import NS_PER_S, Dvl, Imu
 from sonar_graph.navigation import Preintegrator
 from sonar_graph.navigation import odometry as node_motion
 from sonar_graph.navigation.imu_gaps import NO_TURNS
@@ -27,7 +27,6 @@ from sonar_graph.navigation.preintegration.dvl_gaps import gap_values
 from sonar_graph.navigation.preintegration.recursion import NO_MOTION, in_last_frame
 from sonar_graph.numerics.jit import compiled
 from sonar_graph.numerics.mat3 import matrix, vector
-from sonar_graph.sequence import NS_PER_S
 
 from .filters import motion_of, rotation
 

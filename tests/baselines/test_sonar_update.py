@@ -9,9 +9,10 @@ from baselines import sonar_update
 from baselines.ekf_slam import EkfSlam
 from baselines.filter_window import LOST
 from baselines.invariant_ekf import InvariantEkf
+from sonar_graph.measurements import NS_PER_S
 from sonar_graph.numerics.jit import compiled
 from sonar_graph.numerics.mat3 import IDENTITY, ZERO
-from sonar_graph.sequence import NS_PER_S, Sequence
+from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 from sonar_graph.slam.landmarks.association import gate_threshold
 

@@ -25,11 +25,13 @@ from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation.alignment.dvl_imu import DvlMatch
 from sonar_graph.navigation.alignment.time_offset import Estimate1D
 from sonar_graph.sequence import Sequence
+from sonar_graph.settings import parse
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 from sonar_graph.states import Trajectory
 
 UNKNOWN = Estimate1D(np.nan, np.inf, "too little turning")
-GIVEN = Calibration.parse(
+GIVEN = parse(
+    Calibration,
     {
         "imu": {"mounting": {"translation_m": [0.5, 0.1, 0.0]}, "gyro_bias_sigma": 1e-4},
         "dvl": {"mounting": {"translation_m": [-1.0, 0.2, 0.3]}},
@@ -182,7 +184,7 @@ def test_what_speaks_against_both_ways_is_said_in_one_row():
     assert "in motion: alignment: velocities and accelerations differ" in found.said
     assert "inspect" not in found.said
     silent = {"imu": {"gyro_noise_density": 0.0, "accel_noise_density": 0.0}, "dvl": {"velocity_sigma_m_s": [0.0] * 3}}
-    found = find_start_tilt(replace(run, calibration=Calibration.parse(silent, "by hand")))
+    found = find_start_tilt(replace(run, calibration=parse(Calibration, silent, "by hand")))
     assert found.said.endswith("in motion: the calibration's noise is zero")
 
 

@@ -8,6 +8,7 @@ from scipy import stats
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Floats
 from sonar_graph.sequence import Sequence
+from sonar_graph.settings import parse
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 from sonar_graph.simulation.options import DVL_PRESETS, IMU_PRESETS
 
@@ -97,4 +98,4 @@ def test_notes_say_what_was_simulated_and_credit_the_paper_for_what_it_published
     published = simulate_basin().notes
     assert published["from the paper"].endswith("window, 2039 s in all, laps: 3, 0.150 m/s while driving")
     assert "laps" not in published["ours"]
-    assert Calibration.parse(run.calibration.model_dump(mode="json"), "log") == run.calibration
+    assert parse(Calibration, run.calibration.model_dump(mode="json"), "log") == run.calibration

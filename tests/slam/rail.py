@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, SonarCalibration, Start
-from sonar_graph.measurements import Dvl, Floats, Imu
-from sonar_graph.sequence import NS_PER_S, Sequence
+from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu
+from sonar_graph.sequence import Sequence
 
 from .made import detected
 

@@ -15,8 +15,8 @@ from sonar_graph.errors import CalibrationError, EstimatorError
 from sonar_graph.estimator import make_params
 from sonar_graph.evaluation.consistency import normalised_squares
 from sonar_graph.logs.convert.mrclam import read_mrclam
-from sonar_graph.measurements import Floats, LandmarkDetections, Measurements
-from sonar_graph.sequence import NS_PER_S, Sequence
+from sonar_graph.measurements import NS_PER_S, Floats, LandmarkDetections, Measurements
+from sonar_graph.sequence import Sequence
 from sonar_graph.settings import nested, settings_of
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 from sonar_graph.slam import Isam2, Isam2Params

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 from sonar_graph.logs.cdr import Messages
 from sonar_graph.logs.mcap import Topic
-from sonar_graph.measurements import Ints
-from sonar_graph.sequence import NS_PER_S
+from sonar_graph.measurements import NS_PER_S, Ints
 
 Dropped = dict[str, int]
 """Number of rows left out, by reason."""

@@ -19,8 +19,8 @@ from scipy.spatial.transform import Rotation
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting, Start
 from sonar_graph.errors import DatasetError
 from sonar_graph.logs.convert.text_tables import numbered_run, read_table
-from sonar_graph.measurements import Dvl, Floats, Imu
-from sonar_graph.sequence import NS_PER_S, Sequence
+from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu
+from sonar_graph.sequence import Sequence
 from sonar_graph.states import Trajectory
 
 IMU_PERIOD_NS = NS_PER_S // 100

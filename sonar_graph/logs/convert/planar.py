@@ -22,8 +22,8 @@ from sonar_graph.calibration import (
     SonarCalibration,
     Start,
 )
-from sonar_graph.measurements import Dvl, Floats, Imu, Ints, LandmarkDetections
-from sonar_graph.sequence import NS_PER_S, Sequence
+from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu, Ints, LandmarkDetections
+from sonar_graph.sequence import Sequence
 
 FLOOR_SIGMA_M = 1e-3
 """Sigma of a landmark's height over the plane in which it was measured."""

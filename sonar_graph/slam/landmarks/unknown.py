@@ -26,10 +26,9 @@ from gtsam.symbol_shorthand import L
 from numpy.typing import NDArray
 from pydantic import Field
 
-from sonar_graph.calibration import Section
+from sonar_graph.calibration import Section, tagged
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats, LandmarkDetections
-from sonar_graph.settings import tagged
 from sonar_graph.slam.landmarks.association import gate_threshold
 from sonar_graph.slam.landmarks.joint_compatibility import UNPAIRED, Innovations, believed, pair_jointly
 from sonar_graph.slam.landmarks.sighting import LandmarkSightings, Sighting, place, source

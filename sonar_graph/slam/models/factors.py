@@ -25,11 +25,10 @@ import numpy as np
 from pydantic import Field
 from scipy.integrate import quad
 
-from sonar_graph.calibration import Calibration, PlanarMotion, Section
+from sonar_graph.calibration import Calibration, PlanarMotion, Section, tagged
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Floats
 from sonar_graph.navigation import PreintegratedMotion
-from sonar_graph.settings import tagged
 from sonar_graph.slam.models.sonar_model import range_azimuth_jacobians, wrap_angle
 
 UNINFORMATIVE_M = 1e5

@@ -21,10 +21,9 @@ import gtsam
 import numpy as np
 from pydantic import Field
 
-from sonar_graph.calibration import Section
+from sonar_graph.calibration import Section, tagged
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats
-from sonar_graph.settings import tagged
 from sonar_graph.slam.smoother.batch_solution import (
     JointCovariance,
     KeptCovariance,
