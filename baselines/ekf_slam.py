@@ -48,6 +48,7 @@ from baselines.sonar_update import DetectionOutcomes, SonarModel, no_outcomes
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats
+from sonar_graph.motion import MotionSource
 from sonar_graph.numerics import compiled, euler_from_rates, euler_from_rotation, matrix, vector
 
 
@@ -119,14 +120,16 @@ class EkfSlam(FilterShell):
     ----------
     calibration
         Noise, mountings, start, floor.
+    odometry
+        Source of motion, its own.
     params
         None: the defaults.
     """
 
     Params: ClassVar[type[Section]] = EkfSlamParams
 
-    def __init__(self, calibration: Calibration, params: EkfSlamParams | None = None) -> None:
-        super().__init__(calibration, params or EkfSlamParams())
+    def __init__(self, calibration: Calibration, odometry: MotionSource, params: EkfSlamParams | None = None) -> None:
+        super().__init__(calibration, odometry, params or EkfSlamParams())
         start, room = calibration.start, POSE + LANDMARK * ROOM
         self._n, self._x, self._P = POSE, np.zeros(room), np.zeros((room, room))
         self._x[:3] = start.position_m

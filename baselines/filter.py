@@ -22,6 +22,7 @@ from baselines.sonar_update import GATED, NEW, NO_SLOT, USED, DetectionColumns, 
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Depth, Floats, Ints, LandmarkDetections, Measurements
+from sonar_graph.motion import MotionSource
 from sonar_graph.navigation import Odometry
 from sonar_graph.slam.landmarks import identify
 from sonar_graph.states import (
@@ -158,10 +159,11 @@ class FilterShell(ABC):
     def landmark(self, slot: int) -> tuple[Floats, Floats]:
         """Position in the world (3,) and covariance (3, 3) of the landmark in a slot of the state."""
 
-    def __init__(self, calibration: Calibration, params: FilterParams) -> None:
+    def __init__(self, calibration: Calibration, odometry: MotionSource, params: FilterParams) -> None:
         self._vehicle_values = (*vehicle_model(calibration, params.gravity_interval_s),)
         self._sonar_values = (*sonar_model(calibration, params.gate_probability),)
-        self._odometry = Odometry(calibration)
+        assert isinstance(odometry, Odometry)
+        self._odometry = odometry
         self._intake = DetectionIntake(params.minimum_id_probability)
         self._estimates = CausalEstimates()
         self._most_rows = SPARE_ROWS

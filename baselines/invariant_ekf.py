@@ -50,6 +50,7 @@ from baselines.sonar_update import DetectionOutcomes, SonarModel, no_outcomes
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats
+from sonar_graph.motion import MotionSource
 from sonar_graph.numerics import compiled, skew
 
 StateValues = tuple[Floats, Floats, Floats, Floats]
@@ -116,14 +117,18 @@ class InvariantEkf(FilterShell):
     ----------
     calibration
         Noise, mountings, start, floor. ``imu.gyro_bias_sigma = 0`` means that there is no bias, and none that walks.
+    odometry
+        Source of motion, its own.
     params
         None: the defaults.
     """
 
     Params: ClassVar[type[Section]] = InvariantEkfParams
 
-    def __init__(self, calibration: Calibration, params: InvariantEkfParams | None = None) -> None:
-        super().__init__(calibration, params or InvariantEkfParams())
+    def __init__(
+        self, calibration: Calibration, odometry: MotionSource, params: InvariantEkfParams | None = None
+    ) -> None:
+        super().__init__(calibration, odometry, params or InvariantEkfParams())
         has_bias = calibration.imu.gyro_bias_sigma > 0
         self._walk_density = calibration.imu.gyro_bias_walk_density if has_bias else 0.0
         self._state = start_state(calibration)

@@ -15,6 +15,7 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.errors import EstimatorError, UnknownEstimatorError
 from sonar_graph.measurements import Measurements
+from sonar_graph.motion import MotionSource
 from sonar_graph.settings import nested, parse, suggestion
 from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, RefusedRow, Trajectory
 
@@ -31,10 +32,10 @@ class Estimator(Protocol):
     --------
     Run an estimator by hand, as `sonar_graph.run_estimator` does:
 
-    >>> from sonar_graph import load_estimator
+    >>> from sonar_graph import Odometry, load_estimator
     >>> from sonar_graph.testing import small_world
     >>> world = small_world()
-    >>> estimator = load_estimator("dead-reckoning")(world.calibration)
+    >>> estimator = load_estimator("dead-reckoning")(world.calibration, Odometry(world.calibration))
     >>> for step in world.replay(world.instants(rate_hz=1.0)):
     ...     estimate = estimator.process(step)
     >>> len(estimator.trajectory())
@@ -44,7 +45,13 @@ class Estimator(Protocol):
     Params: ClassVar[type[Section]]
     """Settings of this estimator; each has a default."""
 
-    def __init__(self, calibration: Calibration, params: Any = None) -> None: ...
+    def __init__(self, calibration: Calibration, odometry: MotionSource, params: Any = None) -> None:
+        """Make an estimator that has seen nothing.
+
+        ``odometry``: its own source of motion, to which `process` gives the rows of IMU and Doppler log. An estimator
+        that makes its own motion of these rows ignores it.
+        """
+        ...
 
     def process(self, measurements: Measurements) -> Estimate | None:
         """Process measurements; causal estimate at ``end_ns``, None before the first instant with IMU and DVL."""

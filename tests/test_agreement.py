@@ -1,5 +1,7 @@
 """EKF-SLAM, the smoother and dead reckoning where they must say the same."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -10,6 +12,7 @@ from baselines.invariant_ekf import InvariantEkf, InvariantEkfParams
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting, Start
 from sonar_graph.estimator import Estimator
 from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu
+from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.slam import GaussianKernel, Isam2, Isam2Params, KeyframeParams, SmootherParams
 from sonar_graph.states import Estimate
@@ -45,11 +48,15 @@ def difference(one: list[Estimate], other: list[Estimate], axes: slice = slice(0
     return max(poses), max(covs)
 
 
+def made(kind: type[Estimator], calibration: Calibration, params: Any = None) -> Estimator:
+    return kind(calibration, Odometry(calibration), params)
+
+
 def filters(calibration: Calibration) -> list[Estimator]:
     """Both filters, without a gate."""
     return [
-        EkfSlam(calibration, EkfSlamParams(gate_probability=1)),
-        InvariantEkf(calibration, InvariantEkfParams(gate_probability=1)),
+        made(EkfSlam, calibration, EkfSlamParams(gate_probability=1)),
+        made(InvariantEkf, calibration, InvariantEkfParams(gate_probability=1)),
     ]
 
 
@@ -57,7 +64,10 @@ def filters(calibration: Calibration) -> list[Estimator]:
 def test_filter_and_smoother_are_least_squares_where_all_is_linear(params):
     """At every node, with what was measured until then, along x, and in the map at the end: to 1e-6."""
     sequence, numbers = rail(NODES)
-    for estimator in (*filters(sequence.calibration), Isam2(sequence.calibration, params)):
+    for estimator in (
+        *filters(sequence.calibration),
+        made(Isam2, sequence.calibration, params),
+    ):
         for k, estimate in enumerate(run(estimator, sequence), 1):
             mean, variance = numbers.solution(k + 1)
             assert estimate.world_T_body.translation()[0] == pytest.approx(mean[f"x{k}"], abs=1e-6)
@@ -72,7 +82,7 @@ def test_filter_and_smoother_are_least_squares_where_all_is_linear(params):
 def test_filter_and_smoother_agree_where_all_is_linear(params):
     """Between nodes too, and in all that is known of the pose."""
     sequence, _ = rail(NODES)
-    pair = filters(sequence.calibration)[0], Isam2(sequence.calibration, params)
+    pair = filters(sequence.calibration)[0], made(Isam2, sequence.calibration, params)
     assert max(difference(*(run(e, sequence, 10) for e in pair), slice(3, 6))) < 1e-6
 
 
@@ -81,7 +91,7 @@ def test_the_smoothed_trajectory_is_least_squares_with_all_measurements(params):
     """And better than the causal one, but for the last pose."""
     sequence, numbers = rail(NODES)
     mean, variance = numbers.solution(NODES)
-    estimator = Isam2(sequence.calibration, params)
+    estimator = made(Isam2, sequence.calibration, params)
     causal = run(estimator, sequence)
     smoothed = estimator.trajectory()
     for k in range(1, NODES):
@@ -125,18 +135,18 @@ def _waves(t: Floats) -> Floats:
 def test_without_sightings_all_are_dead_reckoning():
     """Poses and whole covariances, at nodes and between them."""
     sequence = winding()
-    reckoned = run(DeadReckoning(sequence.calibration), sequence, 3.7)
+    reckoned = run(made(DeadReckoning, sequence.calibration), sequence, 3.7)
     for kind in (EkfSlam, InvariantEkf, Isam2):
-        assert max(difference(run(kind(sequence.calibration), sequence, 3.7), reckoned)) < 1e-6
+        assert max(difference(run(made(kind, sequence.calibration), sequence, 3.7), reckoned)) < 1e-6
 
 
 @pytest.mark.parametrize("kind", [InvariantEkf, Isam2])
 def test_without_sightings_a_state_carries_the_bias_as_dead_reckoning_does(kind):
     """A constant bias of which nothing is learnt: unknown, and the same at all times."""
     sequence = winding(gyro_bias_sigma=2e-3)
-    reckoned = run(DeadReckoning(sequence.calibration), sequence, 3.7)
-    poses, covariances = difference(run(kind(sequence.calibration), sequence, 3.7), reckoned)
+    reckoned = run(made(DeadReckoning, sequence.calibration), sequence, 3.7)
+    poses, covariances = difference(run(made(kind, sequence.calibration), sequence, 3.7), reckoned)
     assert poses < 1e-6
     assert covariances < 1e-3
-    unaware = run(DeadReckoning(winding().calibration), sequence, 3.7)
+    unaware = run(made(DeadReckoning, winding().calibration), sequence, 3.7)
     assert difference(unaware, reckoned)[1] > 0.1

@@ -22,7 +22,7 @@ class PlainDeadReckoning:
     class Params(Section):
         pass
 
-    def __init__(self, calibration: Calibration, params: Any = None) -> None:
+    def __init__(self, calibration: Calibration, _odometry: Any = None, params: Any = None) -> None:
         self.params = params
         self.pose = calibration.start.pose()
         self.stamp_ns: int | None = None

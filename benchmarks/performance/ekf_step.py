@@ -36,6 +36,7 @@ import numpy as np
 from baselines.ekf_slam import EkfSlam
 from baselines.invariant_ekf import InvariantEkf
 from sonar_graph.measurements import NS_PER_S, Floats, Measurements
+from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
 
@@ -53,10 +54,10 @@ def main() -> int:
     quick = parser.parse_args().quick
     sequence = simulate_mission(MissionOptions(duration_s=QUICK_S if quick else FULL_S, landmarks=20))
     windows = list(sequence.replay(sequence.instants(RATE_HZ)))
-    kinds = EkfSlam, InvariantEkf
+    calibration, kinds = sequence.calibration, (EkfSlam, InvariantEkf)
     for kind in kinds:
-        timed_run(kind(sequence.calibration), windows[:60])
-    rounds = [[timed_run(kind(sequence.calibration), windows) for kind in kinds] for _ in range(ROUNDS)]
+        timed_run(kind(calibration, Odometry(calibration)), windows[:60])
+    rounds = [[timed_run(kind(calibration, Odometry(calibration)), windows) for kind in kinds] for _ in range(ROUNDS)]
     durations_s, invariant_s = (min(of_kind, key=np.sum) for of_kind in zip(*rounds, strict=True))
     median_us, p99_us = 1e6 * np.percentile(durations_s, [50, 99])
     print(f"{len(windows)} updates: median {median_us:.0f} µs, p99 {p99_us:.0f} µs, sum {durations_s.sum():.3f} s")
@@ -98,7 +99,7 @@ def compare_filterpy(sequence: Sequence, windows: list[Measurements], part_s: fl
     part = [window for window in windows if window.end_ns <= until_ns]
     ours_s, sample_s, node_s, in_filterpy_s = [], [], [], []
     for _ in range(ROUNDS):
-        ours = EkfSlam(sequence.calibration)
+        ours = EkfSlam(sequence.calibration, Odometry(sequence.calibration))
         ours_s.append(timed_run(ours, part).sum())
         seconds, by_sample = timed_filterpy(sequence, part[-1].end_ns, predicts_by_node=False)
         sample_s.append(seconds)

@@ -176,7 +176,7 @@ class Race:
 def race(sequence: Sequence) -> Race:
     """All runners over one mission, in turns."""
     instants = frame_instants(sequence)
-    ours = Isam2(sequence.calibration)
+    ours = Isam2(sequence.calibration, Odometry(sequence.calibration))
     runners: dict[str, Callable[[Measurements], gtsam.Pose3 | None]] = {
         "ours": lambda step: pose_of(ours.process(step)),
         "plain": PlainIsam2(sequence.calibration).process,

@@ -35,6 +35,7 @@ from common import conclude, make_parser, note, print_table
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import NS_PER_S, Block, Depth, Dvl, Imu, LandmarkDetections, Measurements
+from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
 from sonar_graph.slam import BoundedHistory, Isam2, Isam2Params, WholeHistory
@@ -142,7 +143,7 @@ def interrupted() -> int:
 def run(mission: StoredMission, params: Isam2Params) -> tuple[Isam2, Record]:
     """The estimator over the whole mission."""
     total, noted = len(mission.frames_ns), time.monotonic()
-    estimator, record = Isam2(mission.calibration, params), Record(total)
+    estimator, record = Isam2(mission.calibration, Odometry(mission.calibration), params), Record(total)
     for step in mission.measurements():
         interruptions, cpu, wall = interrupted(), time.thread_time(), time.perf_counter()
         estimate = estimator.process(step)

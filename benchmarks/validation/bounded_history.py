@@ -19,6 +19,7 @@ sys.path.append(str(Path(__file__).resolve().parents[1]))
 from common import in_parallel, make_parser, print_figures, print_table
 
 from sonar_graph.measurements import Floats
+from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import BasinOptions, MissionOptions, simulate_basin, simulate_mission
 from sonar_graph.slam import Isam2, Isam2Params
@@ -52,7 +53,7 @@ def run_seed(world: str, duration_s: float, seed: int) -> dict[str, Figures]:
 
 def run(sequence: Sequence, settings: dict[str, Any]) -> Figures:
     """One estimator over one run."""
-    estimator = Isam2(sequence.calibration, Isam2Params(**settings))
+    estimator = Isam2(sequence.calibration, Odometry(sequence.calibration), Isam2Params(**settings))
     steps = sequence.replay(sequence.instants(RATE_HZ))
     causal = Trajectory.from_estimates([e for e in map(estimator.process, steps) if e is not None])
     smoothed, landmarks = estimator.trajectory(), estimator.landmarks()

@@ -27,6 +27,7 @@ from common import in_parallel, make_parser, print_figures, print_table, recordi
 
 from sonar_graph.evaluation import compare
 from sonar_graph.logs.convert import read_mrclam
+from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import BasinOptions, MissionOptions, simulate_basin, simulate_mission
 from sonar_graph.slam import Isam2, Isam2Params
@@ -61,7 +62,7 @@ def run(sequence: Sequence, settings: dict[str, Any]) -> tuple[Isam2, int, float
         updates += 1
         update(smoother, time_s)
 
-    estimator = Isam2(sequence.calibration, Isam2Params(**settings))
+    estimator = Isam2(sequence.calibration, Odometry(sequence.calibration), Isam2Params(**settings))
     pieces = list(sequence.replay(sequence.instants(RATE_HZ)))
     Smoother.update = counted  # type: ignore[method-assign]
     try:

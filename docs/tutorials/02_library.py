@@ -77,7 +77,7 @@ print(f"its 1 sigma: {np.sqrt(np.diag(marginals.marginalCovariance(L(1)))).round
 
 # 4. The smoother, as on a vehicle: each call passes the measurements since the last one, and the instant of the
 # estimate. `replay` cuts a log that way; a live program passes blocks of one row.
-smoother = Isam2(calibration, Isam2Params(keyframes=KeyframeParams(max_interval_s=3.0)))
+smoother = Isam2(calibration, Odometry(calibration), Isam2Params(keyframes=KeyframeParams(max_interval_s=3.0)))
 for measurements in sequence.replay(sequence.instants(rate_hz=1.0)):
     estimate = smoother.process(measurements)
 

@@ -213,7 +213,7 @@ class _Replay:
         self._warm_up(kind)
         memory, estimator = PeakMemory(), None
         try:
-            estimator = kind(self._sequence.calibration, self._params)
+            estimator = self._fresh(kind)
             self._process(estimator, progress)
             return self._finish(estimator, memory)
         except Exception as error:  # a third party's estimator may fail in any way, and the others still run
@@ -227,6 +227,13 @@ class _Replay:
             reason = f"{self._stage}: {one_line(error)}"
             return self._result("failed", reason, **told, peak_memory_mb=memory.rise_mb())
 
+    def _fresh(self, kind: type[Estimator]) -> Estimator:
+        """The estimator, with an odometry of its own."""
+        from sonar_graph.navigation import Odometry  # loads numba, which a result does not need
+
+        calibration = self._sequence.calibration
+        return kind(calibration, Odometry(calibration), self._params)
+
     def _warm_up(self, kind: type[Estimator]) -> None:
         """Let an estimator that is thrown away compile its code, until landmarks were seen again."""
 
@@ -236,7 +243,7 @@ class _Replay:
         named = [i for i, step in enumerate(self._steps) if is_named(step.detections)]
         last = named[min(len(named), WARM_UP_FRAMES) - 1] if named else WARM_UP_STEPS
         with contextlib.suppress(Exception):  # what fails here fails again below, where it is reported
-            estimator = kind(self._sequence.calibration, self._params)
+            estimator = self._fresh(kind)
             for step in self._steps[: min(last, MAX_WARM_UP_STEPS) + 1]:
                 estimator.process(copy.deepcopy(step))
 

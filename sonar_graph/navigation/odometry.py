@@ -24,9 +24,9 @@ import numpy as np
 from sonar_graph.calibration import ROWS_BEFORE, Calibration
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints
+from sonar_graph.motion import Motions, PreintegratedMotion
 from sonar_graph.navigation.dvl_screening import RowIntake
 from sonar_graph.navigation.imu_gaps import NO_TURNS, turn_values
-from sonar_graph.navigation.motion import Motions, PreintegratedMotion
 from sonar_graph.navigation.preintegration import (
     Columns,
     Preintegrator,
@@ -87,6 +87,7 @@ class Odometry:
         self._calibration_earth = None
         if latitude is not None:
             self._calibration_earth = 7.292115e-5 * np.array([0.0, np.cos(latitude), np.sin(latitude)])
+        self._running: tuple[object, int, RunningMotion] | None = None
         self._dvl_p_imu = np.subtract(calibration.imu.mounting.translation_m, calibration.dvl.mounting.translation_m)
 
     @property
@@ -114,6 +115,7 @@ class Odometry:
             raise MeasurementError(f"imu, dvl: expected Imu and Dvl, not {type(imu).__name__} and {type(dvl).__name__}")
         placed_imu = imu is not None and self._intake.add_imu(imu)
         placed_dvl = dvl is not None and self._intake.add_dvl(dvl)
+        self._running = None if placed_imu or placed_dvl else self._running
         return placed_imu or placed_dvl
 
     def settle(self, node_ns: int) -> None:
@@ -246,9 +248,13 @@ class Odometry:
             known_ns is None or self.reached_ns(np.array([end_ns]))[0] <= known
         ):
             return motion_between_nodes(self, self._preintegrator, start_ns, end_ns, bias, earth_rate)
-        if earth_rate is None:
+        if not are_nodes(self._imu.stamps_ns, self._dvl.stamps_ns, start_ns, start_ns):
             return motion_between(self, self._preintegrator, start_ns, end_ns, bias)
-        return RunningMotion(self, self._preintegrator, start_ns, bias, earth_rate).until(end_ns)
+        asked = start_ns, bias.tobytes(), None if earth_rate is None else earth_rate.tobytes()
+        if self._running is None or self._running[0] != asked or end_ns < self._running[1]:
+            self._running = asked, end_ns, RunningMotion(self, self._preintegrator, start_ns, bias, earth_rate)
+        self._running = asked, end_ns, self._running[2]
+        return self._running[2].until(end_ns)
 
     def motions(self, start_ns: Ints, end_ns: Ints, known_ns: Ints, bias: Floats) -> Motions:
         """Motions over intervals, each from rows stamped no later than its ``known_ns``."""

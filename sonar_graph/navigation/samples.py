@@ -1,13 +1,7 @@
-"""Rows of a sensor by their stamps: storage, values in between, checks of what a caller gives, and weights of depths.
+"""Rows of a sensor by their stamps: storage, values in between, and checks of what a caller gives.
 
 ``linear``: rate and velocity are piecewise linear through the samples; the mean over a step is the value at its middle.
 ``hold-past``: a sample is the mean over the interval that ends at its stamp.
-
-Depth samples are carried to the end of an interval by the vehicle's own odometry, whose error is a random walk of
-q m²/s that all older samples share; a sample's own noise is white, r. The best weights are those of a Kalman filter for
-a random walk, started from nothing::
-
-    P <- P + q dt,    K = P / (P + r_k),    w <- (1 - K) w,  w_k = K,    P <- (1 - K) P
 """
 
 from math import isfinite
@@ -221,34 +215,6 @@ def first_impossible_covariance(cov: Floats) -> int:
         if not determinant >= -1e-6 * scale - 1e-36:
             return k
     return -1
-
-
-@compiled
-def weights_at_end(variance_m2: Floats, before_end_s: Floats, wander_m2_s: float) -> tuple[Floats, float]:
-    """Weights of depth samples in the height at the end of an interval, and that height's variance.
-
-    Parameters
-    ----------
-    variance_m2
-        r of each sample, in order of time, shape (n,), n >= 1.
-    before_end_s
-        Time from each sample to the end, not increasing, shape (n,).
-    wander_m2_s
-        q, the spectral density of the odometry's vertical velocity noise, m²/s.
-
-    Returns
-    -------
-    Weights with sum 1, shape (n,), and the variance, m².
-    """
-    weights = np.zeros(len(variance_m2))
-    weights[0], P = 1.0, variance_m2[0]
-    for k in range(1, len(variance_m2)):
-        P += wander_m2_s * (before_end_s[k - 1] - before_end_s[k])
-        gain = P / (P + variance_m2[k])
-        weights *= 1.0 - gain
-        weights[k] = gain
-        P *= 1.0 - gain
-    return weights, P + wander_m2_s * max(before_end_s[-1], 0.0)
 
 
 def longest_interval_ns(calibration: Calibration) -> int:

@@ -20,6 +20,7 @@ from pydantic import BaseModel, model_validator
 from sonar_graph.calibration import Calibration, Section, misfits
 from sonar_graph.errors import CalibrationError, EstimatorError
 from sonar_graph.measurements import NS_PER_S, Floats, Ints, Measurements
+from sonar_graph.motion import MotionSource
 from sonar_graph.slam.estimates import AnchoredPose, Over, PoseHistory, joint_covariance
 from sonar_graph.slam.frontend import Sightings
 from sonar_graph.slam.keyframes import KeyframeParams, Keyframes
@@ -98,15 +99,18 @@ class Isam2:
     ----------
     calibration
         What is known before the run.
+    odometry
+        Source of motion, its own, such as `sonar_graph.navigation.Odometry`.
     params
         Settings; None for the defaults.
 
     Examples
     --------
+    >>> from sonar_graph import Odometry
     >>> from sonar_graph.slam import Isam2, Isam2Params
     >>> from sonar_graph.testing import small_world
     >>> world = small_world()
-    >>> isam2 = Isam2(world.calibration, Isam2Params())
+    >>> isam2 = Isam2(world.calibration, Odometry(world.calibration), Isam2Params())
     >>> for step in world.replay(world.instants(rate_hz=2.0)):
     ...     estimate = isam2.process(step)
     >>> isam2.landmarks().ids
@@ -117,7 +121,7 @@ class Isam2:
 
     Params: ClassVar[type[Section]] = Isam2Params
 
-    def __init__(self, calibration: Calibration, params: Any = None) -> None:
+    def __init__(self, calibration: Calibration, odometry: MotionSource, params: Any = None) -> None:
         if not isinstance(params, Isam2Params | None):
             raise EstimatorError(
                 f"isam2: params: expected Isam2Params or None, not {type(params).__name__}; of a dict:"
@@ -136,7 +140,7 @@ class Isam2:
         self._params = p = params or Isam2Params()
         self._smoother = Smoother(p.smoother, is_bounded=p.history.policy == "bounded")
         self._smoother.when_leaving = self._leave
-        self._keyframes = Keyframes(calibration, p.keyframes, self._smoother)
+        self._keyframes = Keyframes(calibration, odometry, p.keyframes, self._smoother)
         self._sightings = Sightings(calibration, p.identity, p.kernel, self._smoother, self._keyframes)
         self._asked = PoseHistory()
         self._forgot_s = -math.inf

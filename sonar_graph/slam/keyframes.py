@@ -10,6 +10,7 @@ ranges. NaN is sound: the log does not know the noise, and the calibration does.
 
 from bisect import bisect_left
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import TypeVar
 
 import gtsam
@@ -20,16 +21,9 @@ from pydantic import Field
 
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.measurements import Depth, Dvl, Floats, Imu, LandmarkDetections, possible_ranges
-from sonar_graph.navigation import (
-    Odometry,
-    PreintegratedMotion,
-    RunningMotion,
-    in_numbers,
-    motion_between_nodes,
-    weights_at_end,
-)
-from sonar_graph.navigation.alignment import earth_rate_in_world, gravity_direction, velocity_at_imu
-from sonar_graph.navigation.preintegration import Preintegrator, Steps
+from sonar_graph.motion import MotionSource, PreintegratedMotion
+from sonar_graph.navigation import in_numbers
+from sonar_graph.navigation.alignment import gravity_direction
 from sonar_graph.numerics import compiled
 from sonar_graph.slam.models import factors
 from sonar_graph.slam.smoother import Smoother
@@ -104,6 +98,7 @@ class Keyframes:
     """Sets keyframes along the odometry and adds their factors to a smoother."""
 
     calibration: Calibration
+    odometry: MotionSource
     params: KeyframeParams
     smoother: Smoother
     stamps_ns: list[int] = field(default_factory=list)
@@ -114,16 +109,13 @@ class Keyframes:
     """Latest instant that was advanced to."""
 
     def __post_init__(self) -> None:
-        self.odometry = Odometry(self.calibration)
-        self._preintegrator = Preintegrator.from_calibration(self.calibration)
         self._estimates_bias = self.calibration.imu.gyro_bias_sigma > 0
         self._bias_since_ns = 0
-        self._running: RunningMotion | None = None
         self._latest: tuple[int, PreintegratedMotion] | None = None
+        self._linearised: tuple[Floats, Floats] | None = None
         self._depths: list[Depth] = []
         self._told = 0
         self._refused: list[RefusedRow] = []
-        self._earth = earth_rate_in_world(self.calibration)
 
     @property
     def newest_ns(self) -> int | None:
@@ -153,8 +145,7 @@ class Keyframes:
         if depth is not None:
             variance = np.where(np.isnan(depth.variance_m2), 1.0, depth.variance_m2)
             depth = self._sound("depth", depth, (variance > 0) & np.isfinite(variance))
-        if self.odometry.add(imu, dvl):
-            self._running = None
+        self.odometry.add(imu, dvl)
         self._latest = None
         newest_ns = self._depths[-1].stamps_ns[-1] if self._depths else EARLIEST_NS
         if depth is not None and depth.stamps_ns[0] < newest_ns:
@@ -193,13 +184,14 @@ class Keyframes:
                 self.smoother.add([factors.bias_prior(B(0), self.calibration.imu.gyro_bias_sigma)])
             self._constrain(0)
         interval_ns = round(self.params.max_interval_s / S_PER_NS)
-        for node_ns in self.odometry.nodes(self.stamps_ns[-1], until_ns).tolist():
+        for node_ns in self.odometry.epochs(self.stamps_ns[-1], until_ns).tolist():
             if node_ns - self.stamps_ns[-1] >= interval_ns:
                 self._set(node_ns)
 
     def set_for_frame(self, stamp_ns: int, motion: PreintegratedMotion) -> PreintegratedMotion:
         """Set a keyframe if a frame needs a newer one; the motion from the then newest keyframe to the frame."""
-        node_ns = self.odometry.newest_node(self.stamps_ns[-1], stamp_ns)
+        epochs_ns = self.odometry.epochs(self.stamps_ns[-1], stamp_ns)
+        node_ns = int(epochs_ns[-1]) if len(epochs_ns) else None
         if node_ns is not None:
             sonar, bias_sigma = self.calibration.sonar, self.calibration.imu.gyro_bias_sigma
             turn, shift = largest_variances(motion.covariance, motion.D_bias, bias_sigma)
@@ -217,16 +209,10 @@ class Keyframes:
 
     def motion_since_newest(self, until_ns: int) -> PreintegratedMotion:
         """Provisional motion from the newest keyframe to an instant not before that of any earlier call."""
-        if self._running is None:
-            self._running = RunningMotion(
-                self.odometry,
-                self._preintegrator,
-                self.stamps_ns[-1],
-                self.bias(len(self.stamps_ns) - 1),
-                self._earth_rate(),
-            )
         if self._latest is None or self._latest[0] != until_ns:
-            self._latest = until_ns, self._running.until(until_ns)
+            if self._linearised is None:  # iterations in between do not touch motions until the next keyframe
+                self._linearised = self.bias(len(self.stamps_ns) - 1), self._attitude()
+            self._latest = until_ns, self.odometry.motion(self.stamps_ns[-1], until_ns, *self._linearised)
         return self._latest[1]
 
     def update_if_due(self) -> None:
@@ -242,67 +228,64 @@ class Keyframes:
         """Key of the bias that holds from a keyframe on, -1 the newest; None when there is none to estimate."""
         return self.bias_keys[index] if self._estimates_bias else None
 
-    def _earth_rate(self) -> Floats | None:
-        if self._earth is None:
-            return None
-        return self.smoother.values.atPose3(self.newest_key).rotation().matrix().T @ self._earth
+    def _attitude(self) -> Floats:
+        """world_R_body at the newest keyframe."""
+        return self.smoother.values.atPose3(self.newest_key).rotation().matrix()
 
     def _set(self, node_ns: int) -> None:
         i, j = len(self.stamps_ns) - 1, len(self.stamps_ns)
-        start_ns, bias, earth_rate = self.stamps_ns[-1], self.bias(i), self._earth_rate()
-        gaps = self.odometry.gaps(start_ns, node_ns)
-        since_ns = gaps[-1][1] - CARRIED_IN_GAP_NS if gaps else start_ns  # depth samples are carried over no gap
-        steps = self.odometry.steps_to_node(since_ns, node_ns)
-        motion = carried = self._preintegrator.integrate(steps, bias, earth_rate)
-        if gaps:
-            motion = motion_between_nodes(self.odometry, self._preintegrator, start_ns, node_ns, bias, earth_rate)
+        start_ns, bias, attitude = self.stamps_ns[-1], self.bias(i), self._attitude()
+        motion = self.odometry.motion(start_ns, node_ns, bias, attitude)
         self.smoother.add_pose(X(j), self.smoother.values.atPose3(X(i)).compose(motion.i_T_j), node_ns * S_PER_NS)
         if self._estimates_bias:
             between = factors.odometry_with_bias(X(i), X(j), self.bias_keys[i], motion)
         else:
             between = factors.odometry(X(i), X(j), motion)
         self.smoother.add([between, *self._gravity(j, node_ns, motion)])
-        self.smoother.add(self._depth(j, node_ns, since_ns, steps, carried))
+        self.smoother.add(self._depth(j, start_ns, node_ns, bias))
         self.bias_keys.append(self._next_bias_key(i, node_ns))
         self.stamps_ns.append(node_ns)
-        self._running = self._latest = None
+        self._linearised = self._latest = None
         self._constrain(j)
         self.odometry.forget_before(node_ns)
 
     def _gravity(self, j: int, node_ns: int, motion: PreintegratedMotion) -> list[gtsam.NonlinearFactor]:
         if not self.calibration.use_gravity:
             return []
-        (v_i, cov_i, rate_i), (v_j, cov_j, rate_j) = map(self.odometry.velocity_at_node, (self.stamps_ns[-1], node_ns))
-        imu, dvl_m = self.calibration.imu, np.array(self.calibration.dvl.mounting.translation_m)
-        imu_m = np.array(imu.mounting.translation_m)
-        at_i, at_j = velocity_at_imu(v_i, rate_i, dvl_m, imu_m), velocity_at_imu(v_j, rate_j, dvl_m, imu_m)
-        sigma = float(np.sqrt((np.trace(cov_i) + np.trace(cov_j)) / 6))
-        up = gravity_direction(motion, at_i, at_j, sigma, imu, self.calibration.gravity_m_s2)
+        (v_i, variance_i), (v_j, variance_j) = map(self.odometry.velocity_at_imu, (self.stamps_ns[-1], node_ns))
+        sigma = float(np.sqrt(0.5 * (variance_i + variance_j)))
+        up = gravity_direction(motion, v_i, v_j, sigma, self.calibration.imu, self.calibration.gravity_m_s2)
         return [factors.gravity_direction(X(j), *up)] if up else []
 
-    def _depth(
-        self, j: int, node_ns: int, start_ns: int, steps: Steps, motion: PreintegratedMotion
-    ) -> list[gtsam.NonlinearFactor]:
-        """One factor for the samples since an instant, carried by the motion to this keyframe and averaged there."""
+    def _depth(self, j: int, start_ns: int, node_ns: int, bias: Floats) -> list[gtsam.NonlinearFactor]:
+        """One factor for the samples since the last keyframe, carried to this one by odometry and averaged there.
+
+        Samples are carried over no gap of the Doppler log. The port at sample k lies at ``k_T_j^-1 port`` in frame j.
+        """
         if not self._depths:
             return []
         waiting = Depth.concatenate(self._depths)
         later = waiting.between(node_ns, LATEST_NS)
         self._depths = [later] if later else []
-        samples = waiting.between(start_ns, node_ns)
+        epochs_ns = [start_ns, *self.odometry.epochs(start_ns, node_ns).tolist()]
+        found_ns = [b for a, b in pairwise(epochs_ns) if self.odometry.is_gap(a, b)]
+        samples = waiting.between(found_ns[-1] - CARRIED_IN_GAP_NS if found_ns else start_ns, node_ns)
         if samples is None:
             return []
-        up = self.smoother.values.atPose3(self.newest_key).rotation().matrix()[2]
-        mean_psd = np.average(steps.velocity_psd, axis=0, weights=steps.duration_s)
-        wander_m2_s = float(up @ mean_psd @ up)  # spectral density of the vertical velocity noise
+        until_ns = np.append(samples.stamps_ns[1:], node_ns)
+        known_ns = np.full(len(samples), self.odometry.reached_ns(np.array([node_ns]))[0])
+        motions = self.odometry.motions(samples.stamps_ns, until_ns, known_ns, bias)
+        up, port = self._attitude()[2], np.array(self.calibration.depth.port_m)
+        k_R_j, k_p_j = np.eye(3), np.zeros(3)
+        ports, wander_m2 = np.empty((len(samples), 3)), np.empty(len(samples))
+        for k in reversed(range(len(samples))):
+            up_k = k_R_j @ up
+            wander_m2[k] = up_k @ motions.C[k, 3:, 3:] @ up_k
+            k_R_j, k_p_j = motions.dR[k] @ k_R_j, motions.dp[k] + motions.dR[k] @ k_p_j
+            ports[k] = k_R_j.T @ (port - k_p_j)
         variance = np.where(np.isnan(samples.variance_m2), self.calibration.depth.sigma_m**2, samples.variance_m2)
-        offsets_s = np.asarray((samples.stamps_ns - start_ns) * S_PER_NS, dtype=np.float64)
-        weights, mean_variance = weights_at_end(variance, motion.duration_s - offsets_s, wander_m2_s)
-        port = np.array(self.calibration.depth.port_m)
-        mean_port = weights @ self._preintegrator.path_of(port, steps, motion.bias, offsets_s)
-        return [
-            factors.depth(X(j), float(weights @ samples.z_m), motion.i_T_j.transformTo(mean_port), mean_variance**0.5)
-        ]
+        weights, mean_variance = weights_at_end(variance, wander_m2)
+        return [factors.depth(X(j), float(weights @ samples.z_m), weights @ ports, mean_variance**0.5)]
 
     def _constrain(self, j: int) -> None:
         if self.calibration.planar:
@@ -329,3 +312,32 @@ def largest_variances(cov: Floats, D_bias: Floats, bias_sigma: float) -> tuple[f
         by_bias = D_bias[r, 0] ** 2 + D_bias[r, 1] ** 2 + D_bias[r, 2] ** 2
         largest[r // 3] = max(largest[r // 3], cov[r, r] + by_bias * bias_sigma**2)
     return largest[0], largest[1]
+
+
+def weights_at_end(variance_m2: Floats, wander_m2: Floats) -> tuple[Floats, float]:
+    """Weights of depth samples in the height at the end of an interval, and that height's variance.
+
+    Samples are carried to the end by odometry, whose error is a random walk that all older samples share; a sample's
+    own noise is white. The best weights are those of a Kalman filter for a random walk, started from nothing::
+
+        K = P / (P + r_k),    w <- (1 - K) w,  w_k = K,    P <- (1 - K) P + q_k
+
+    Parameters
+    ----------
+    variance_m2
+        r of each sample, in order of time, shape (n,), n >= 1.
+    wander_m2
+        q: vertical variance of the odometry from each sample to the next, and from the last to the end, shape (n,).
+
+    Returns
+    -------
+    Weights with sum 1, shape (n,), and the variance, m².
+    """
+    weights = np.zeros(len(variance_m2))
+    P = np.inf
+    for k, (r, q) in enumerate(zip(variance_m2.tolist(), wander_m2.tolist(), strict=True)):
+        gain = P / (P + r) if k else 1.0
+        weights *= 1.0 - gain
+        weights[k] = gain
+        P = ((1.0 - gain) * P if k else r) + q
+    return weights, P

@@ -1,6 +1,6 @@
 """Laws of the estimator contract as checks that an author can run on an estimator.
 
-Each check takes something that makes an estimator from a calibration, such as its class, and raises
+Each check takes something that makes an estimator from calibration and odometry, such as its class, and raises
 `ContractError` where the law is broken. With pytest::
 
     import pytest
@@ -25,6 +25,8 @@ from scipy.spatial.transform import Rotation
 from sonar_graph.calibration import Calibration
 from sonar_graph.estimator import Estimator
 from sonar_graph.measurements import NS_PER_S, Floats, Ints
+from sonar_graph.motion import MotionSource
+from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Trajectory
 from sonar_graph.testing.drives import (
@@ -39,7 +41,7 @@ from sonar_graph.testing.drives import (
     still_world,
 )
 
-MakeEstimator = Callable[[Calibration], Estimator]
+MakeEstimator = Callable[[Calibration, MotionSource], Estimator]
 ASK_HZ = 1.0
 SYMMETRY = 1e-9
 """Largest asymmetry or negative eigenvalue of a covariance, relative to its largest entry."""
@@ -64,6 +66,11 @@ class EstimatorRun:
         return Trajectory.from_estimates([e for e in self.estimates if e.stamp_ns in wanted])
 
 
+def fresh(make: MakeEstimator, calibration: Calibration) -> Estimator:
+    """Estimator that has seen nothing, with an odometry of its own."""
+    return make(calibration, Odometry(calibration))
+
+
 def run(
     make: MakeEstimator, sequence: Sequence, instants_ns: Ints | None = None, *, ask_every: int = 0
 ) -> EstimatorRun:
@@ -72,7 +79,7 @@ def run(
     ``ask_every``: also ask twice after every so many steps, and again at the end; 0: only at the end.
     Raises `ContractError` when the answers to one question, asked twice, differ.
     """
-    estimator = make(sequence.calibration)
+    estimator = fresh(make, sequence.calibration)
     estimates: list[Estimate] = []
     steps = sequence.replay(sequence.instants(ASK_HZ) if instants_ns is None else instants_ns)
     for number, step in enumerate(steps, start=1):
@@ -188,14 +195,14 @@ LIVE_COVARIANCE = 0.25
 def settings_have_defaults(make: MakeEstimator) -> None:
     """``Params()`` can be made without arguments."""
     try:
-        make(small_world().calibration).Params()
+        fresh(make, small_world().calibration).Params()
     except Exception as error:
         raise ContractError(f"Params() fails: {error}") from error
 
 
 def knows_nothing_before_the_first_measurement(make: MakeEstimator) -> None:
     """A fresh estimator has no pose, no landmark and no detection."""
-    estimator = make(small_world().calibration)
+    estimator = fresh(make, small_world().calibration)
     sizes = len(estimator.trajectory()), len(estimator.landmarks()), len(estimator.detections())
     require(sizes == (0, 0, 0), f"a fresh estimator has {sizes} poses, landmarks, detections")
 
@@ -203,7 +210,7 @@ def knows_nothing_before_the_first_measurement(make: MakeEstimator) -> None:
 def answers_from_the_first_imu_and_dvl_on(make: MakeEstimator) -> None:
     """`process` returns None before there is an IMU and a DVL sample, and afterwards an estimate at ``end_ns``."""
     world = small_world(dvl_delay_s=1.0)
-    estimator = make(world.calibration)
+    estimator = fresh(make, world.calibration)
     instants = np.arange(START_NS + NS_PER_S // 4, world.end_ns, NS_PER_S // 4)
     for step in world.replay(instants):
         estimate = estimator.process(step)
@@ -357,7 +364,7 @@ def check_estimator(make: MakeEstimator) -> None:
     Parameters
     ----------
     make
-        Makes an estimator from a calibration; the class of an estimator does.
+        Makes an estimator from a calibration and an odometry; the class of an estimator does.
 
     Raises
     ------

@@ -10,6 +10,7 @@ from baselines.ekf_slam import EkfSlam
 from baselines.filter_window import LOST
 from baselines.invariant_ekf import InvariantEkf
 from sonar_graph.measurements import NS_PER_S
+from sonar_graph.navigation import Odometry
 from sonar_graph.numerics.jit import compiled
 from sonar_graph.numerics.mat3 import IDENTITY, ZERO
 from sonar_graph.sequence import Sequence
@@ -145,7 +146,7 @@ def nees_after_gap(kind, seed, forgets_gap):
     closed_ns = lost.stamps_ns[first_after + 1]  # the second row confirms the first
     after_ns = closed_ns + np.round(AFTER_S * NS_PER_S).astype(np.int64)
     sequence = Sequence("gap", mission.calibration, mission.imu, lost, None, mission.detections)
-    estimator, squares = kind(mission.calibration), []
+    estimator, squares = kind(mission.calibration, Odometry(mission.calibration)), []
     for window in sequence.replay(np.r_[closed_ns + NS_PER_S // 50, after_ns]):
         estimate = estimator.process(window)
         if forgets_gap:

@@ -29,8 +29,8 @@ class Params(Section):
 class Noisy(DeadReckoning):
     Params = Params
 
-    def __init__(self, calibration, params=None):
-        super().__init__(calibration)
+    def __init__(self, calibration, odometry, params=None):
+        super().__init__(calibration, odometry)
         self._sigma, self._rng = (params or Params()).velocity_noise_m_s, np.random.default_rng(0)
 
     def process(self, measurements):

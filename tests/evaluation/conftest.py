@@ -54,7 +54,7 @@ class Offset:
         offset_m: float = 0.3
         sigma_m: float = 0.3
 
-    def __init__(self, _calibration: Calibration, params: Any = None) -> None:
+    def __init__(self, _calibration: Calibration, _odometry: Any = None, params: Any = None) -> None:
         self.params = params or self.Params()
         self.estimates: list[Estimate] = []
 

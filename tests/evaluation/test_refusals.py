@@ -20,6 +20,7 @@ from sonar_graph.evaluation.run import run_estimator
 from sonar_graph.evaluation.storage import read_comparison, write_comparison
 from sonar_graph.logs.writing import write_log
 from sonar_graph.measurements import Dvl, Measurements
+from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 from sonar_graph.slam.landmarks.sighting import SightingFactors
@@ -97,7 +98,7 @@ def test_outliers_are_named_and_not_used(straight, name):
 
 def live(name: str, sequence: Sequence, late: Measurements | None) -> tuple[Estimate | None, list[RefusedRow]]:
     """Half a second of both sensors is missing, and perhaps comes at the end."""
-    estimator = load_estimator(name)(sequence.calibration)
+    estimator = load_estimator(name)(sequence.calibration, Odometry(sequence.calibration))
     resumed_ns = HELD_NS[1] + 4 * NS
     for after_ns, until_ns in ((0, HELD_NS[0]), (HELD_NS[1], resumed_ns), (resumed_ns, sequence.end_ns)):
         imu, dvl = sequence.imu.between(after_ns, until_ns), sequence.dvl.between(after_ns, until_ns)

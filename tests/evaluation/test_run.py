@@ -16,6 +16,7 @@ from sonar_graph.evaluation.results import RunResult
 from sonar_graph.evaluation.run import PeakMemory, run_estimator
 from sonar_graph.evaluation.scored_instants import map_instants
 from sonar_graph.measurements import LandmarkDetections
+from sonar_graph.navigation import Odometry
 from sonar_graph.states import Estimate, LandmarkMap, Refusal, RefusedRow, Trajectory
 
 from .conftest import Offset, straight_sequence
@@ -193,7 +194,12 @@ def test_a_run_names_what_was_refused_and_withheld_even_where_it_fails(ran, can_
     if can_tell:
         assert ran(**methods).withheld == told["withheld"], "also in runs that end"
     assert (ran().refused, ran().withheld) == ([], []), "telling is optional"
-    assert withheld_of(load_estimator("dead-reckoning")(straight_sequence().calibration)) == []
+    assert (
+        withheld_of(
+            load_estimator("dead-reckoning")(straight_sequence().calibration, Odometry(straight_sequence().calibration))
+        )
+        == []
+    )
 
 
 NAN_POSE = gtsam.Pose3(gtsam.Rot3(), np.array([np.nan, 0.0, 0.0]))

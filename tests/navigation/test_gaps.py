@@ -132,7 +132,8 @@ ESTIMATORS = ("dead-reckoning", "ekf-slam", "invariant-ekf", "isam2")
 
 def estimates(name, blocks, start=KNOWN_START):
     """The last estimate of an estimator that is given blocks of rows until instants."""
-    estimator = load_estimator(name)(Calibration(imu=NOISY, dvl=DVL, start=start, use_gravity=False))
+    calibration = Calibration(imu=NOISY, dvl=DVL, start=start, use_gravity=False)
+    estimator = load_estimator(name)(calibration, Odometry(calibration))
     return [estimator.process(Measurements(until_ns, *block)) for until_ns, block in blocks][-1]
 
 

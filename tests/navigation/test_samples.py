@@ -188,23 +188,6 @@ def test_an_impossible_covariance_is_found_in_every_row(row):
 
 
 @given(
-    st.lists(st.tuples(st.floats(0.01, 2.0), st.floats(1e-5, 1e-2)), min_size=1, max_size=12),
-    st.floats(1e-8, 1e-2),
-    st.floats(0.0, 1.0),
-)
-def test_weights_are_those_of_least_squares_with_a_shared_random_walk(depths, wander, last_s):
-    """Two samples share the error of the way that both are carried: C_kl = q min(t_k, t_l) + r_k for k = l."""
-    steps, variance = np.array(depths).T
-    before_end = last_s + np.append(np.cumsum(steps[:0:-1])[::-1], 0.0)
-    C = wander * np.minimum.outer(before_end, before_end) + np.diag(variance)
-    ones = np.ones(len(variance))
-    expected = np.linalg.solve(C, ones) / (ones @ np.linalg.solve(C, ones))
-    weights, mean_variance = samples.weights_at_end(variance, before_end, wander)
-    assert weights == pytest.approx(expected, rel=1e-6, abs=1e-9)
-    assert mean_variance == pytest.approx(1 / (ones @ np.linalg.solve(C, ones)), rel=1e-6)
-
-
-@given(
     arrays.arrays(np.float64, (3, 3), elements=st.floats(-1, 1)), st.integers(0, 3), st.sampled_from([1e-3, 1.0, 1e3])
 )
 def test_covariances_are_possible_exactly_where_no_eigenvalue_is_negative(A, rank, scale):

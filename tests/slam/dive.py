@@ -5,6 +5,7 @@ import numpy as np
 
 from sonar_graph.calibration import Calibration, FloorPrior, ImuCalibration, Mounting, SonarCalibration, Start
 from sonar_graph.measurements import Dvl, Floats, Imu
+from sonar_graph.navigation import Odometry
 from sonar_graph.slam import GatedIdentity, GaussianKernel, KeyframeParams, MixtureIdentity, RobustKernel
 from sonar_graph.slam.frontend import Sightings
 from sonar_graph.slam.keyframes import Keyframes
@@ -46,7 +47,7 @@ class Dive:
         smoother: Smoother | None = None,
     ) -> None:
         self.smoother = smoother or smoother_with(lag_s, 1e-6, 1e9)
-        self.keyframes = Keyframes(calibration, POLICY, self.smoother)
+        self.keyframes = Keyframes(calibration, Odometry(calibration), POLICY, self.smoother)
         self.sightings = Sightings(calibration, identity, kernel, self.smoother, self.keyframes)
         stamps = T0_NS + np.arange(-1, 101) * NS // 10
         doppler = np.r_[START_NS, stamps[1:]]  # the second row confirms the first

@@ -11,7 +11,7 @@ from gtsam.symbol_shorthand import B, L, X
 from numpy.typing import ArrayLike
 
 from sonar_graph.measurements import Floats, LandmarkDetections
-from sonar_graph.navigation import PreintegratedMotion
+from sonar_graph.navigation import Odometry, PreintegratedMotion
 from sonar_graph.sequence import Sequence
 from sonar_graph.settings import nested
 from sonar_graph.slam import Isam2, Isam2Params
@@ -33,7 +33,7 @@ def isam2_params(**given: Any) -> Isam2Params:
 
 def ran(sequence: Sequence, rate_hz: float = 2.0, **params: Any) -> tuple[Isam2, list[Estimate]]:
     """The estimator after a run, and its causal estimates."""
-    estimator = Isam2(sequence.calibration, isam2_params(**params))
+    estimator = Isam2(sequence.calibration, Odometry(sequence.calibration), isam2_params(**params))
     return estimator, estimates_of(estimator, sequence, rate_hz)
 
 

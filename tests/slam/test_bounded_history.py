@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import L
 
+from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 from sonar_graph.slam import Isam2
@@ -95,7 +96,8 @@ def test_nothing_grows_with_the_run(tracks):
     """What is held after a minute and after four differs by less than a window; of a whole history it does not."""
     sequence = simulate_mission(MissionOptions(duration_s=240.0, tracks=tracks, id_delay_s=2.0 if tracks else 0.0))
     sizes, counts = [], []
-    estimator = Isam2(sequence.calibration, isam2_params(history__policy="bounded", smoother__lag_s=LAG_S))
+    params = isam2_params(history__policy="bounded", smoother__lag_s=LAG_S)
+    estimator = Isam2(sequence.calibration, Odometry(sequence.calibration), params)
     for step in sequence.replay(sequence.instants(2.0)):
         estimator.process(step)
         if round((step.end_ns - sequence.start_ns) * 1e-9, 3) in (60.0, 120.0, 180.0, 239.0):
@@ -149,7 +151,8 @@ def test_a_window_that_begins_anew_says_the_same():
     """On the rail all is linear: QR and a restart change nothing."""
     sequence, _ = rail(31)
     plain, expected = run(sequence, "bounded", **LINEAR, smoother__lag_s=2.0)
-    estimator = Isam2(sequence.calibration, isam2_params(history__policy="bounded", **LINEAR, smoother__lag_s=2.0))
+    params = isam2_params(history__policy="bounded", **LINEAR, smoother__lag_s=2.0)
+    estimator = Isam2(sequence.calibration, Odometry(sequence.calibration), params)
     for k, step in enumerate(sequence.replay(sequence.instants(2.0))):
         estimate = estimator.process(step)
         assert estimate is not None

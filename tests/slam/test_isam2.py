@@ -16,6 +16,7 @@ from sonar_graph.estimator import make_params
 from sonar_graph.evaluation.consistency import normalised_squares
 from sonar_graph.logs.convert.mrclam import read_mrclam
 from sonar_graph.measurements import NS_PER_S, Floats, LandmarkDetections, Measurements
+from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.settings import nested, settings_of
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
@@ -113,7 +114,7 @@ def test_nothing_peeks_ahead(basin, cut_s):
 def test_motion_and_depth_that_arrive_early_are_not_used_early():
     """All rows but the detections at once: the estimates are those of rows that come in time."""
     sequence = small_world()
-    early = Isam2(sequence.calibration)
+    early = Isam2(sequence.calibration, Odometry(sequence.calibration))
     for k, (step, expected) in enumerate(zip(sequence.replay(sequence.instants(2.0)), ran(sequence)[1], strict=True)):
         blocks = (None, None, None) if k else (sequence.imu, sequence.dvl, sequence.depth)
         assert same(expected, early.process(Measurements(step.end_ns, *blocks, step.detections)))
@@ -160,7 +161,7 @@ def test_twenty_basins_are_consistent():
 
 def test_time_does_not_go_back(basin):
     """The same instant again is the same estimate and one row of the trajectory; an earlier one gets none."""
-    estimator, instants = Isam2(basin.calibration), basin.instants(1.0)[:20]
+    estimator, instants = Isam2(basin.calibration, Odometry(basin.calibration)), basin.instants(1.0)[:20]
     first = [estimator.process(m) for m in basin.replay(instants)][-1]
     again = estimator.process(Measurements(int(instants[-1])))
     assert again.world_T_body.equals(first.world_T_body, 1e-12)
@@ -174,7 +175,7 @@ def test_noise_of_zero_is_refused_by_name(basin, section, name):
     zero = 0.0 if section == "imu" else (0.0, 0.0, 0.0)
     calibration = basin.calibration.model_copy(update={section: part.model_copy(update={name: zero})})
     with pytest.raises(CalibrationError, match=f"{section}.{name}"):
-        Isam2(calibration)
+        Isam2(calibration, Odometry(calibration))
 
 
 LAG_S = 3.0
@@ -197,7 +198,7 @@ def test_asking_changes_nothing(chosen: str) -> None:
 
 def test_landmarks_list_and_covariances_are_of_one_choice() -> None:
     world = misnamed_world()
-    estimator = Isam2(world.calibration, settings("max-mixture", "whole", "ignore"))
+    estimator = Isam2(world.calibration, Odometry(world.calibration), settings("max-mixture", "whole", "ignore"))
     differing = []
     for step in world.replay(world.instants(1.0)):
         estimator.process(step)

@@ -7,6 +7,8 @@ import gtsam
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, X
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import (
@@ -20,9 +22,9 @@ from sonar_graph.calibration import (
     Start,
 )
 from sonar_graph.measurements import Depth, Dvl, Imu
-from sonar_graph.navigation import PreintegratedMotion
+from sonar_graph.navigation import Odometry, PreintegratedMotion
 from sonar_graph.navigation.alignment.gravity import earth_rate_in_world
-from sonar_graph.slam.keyframes import KeyframeParams, Keyframes, positive_definite
+from sonar_graph.slam.keyframes import KeyframeParams, Keyframes, positive_definite, weights_at_end
 from tests.navigation.rows import NS, T0_NS, dvl, imu, stamps
 
 from .graphs import factors_of
@@ -51,7 +53,7 @@ def steady_dvl(until_s: float, velocity=(0.5, 0.0, 0.0)) -> Dvl:
 
 
 def keyframes_of(calibration: Calibration, policy: KeyframeParams = POLICY) -> Keyframes:
-    return Keyframes(calibration, policy, smoother_with(1e9, 0.01, 1e9))
+    return Keyframes(calibration, Odometry(calibration), policy, smoother_with(1e9, 0.01, 1e9))
 
 
 def driven(
@@ -355,3 +357,16 @@ def test_positive_definite_are_those_whose_eigenvalues_are_above_zero(k):
         matrix = np.eye(k)
         matrix[i, j] = matrix[j, i] = wrong
         assert positive_definite(np.stack([np.eye(k), matrix])).tolist() == [True, False]
+
+
+@given(st.lists(st.tuples(st.floats(1e-9, 1e-2), st.floats(1e-5, 1e-2)), min_size=1, max_size=12))
+def test_weights_are_those_of_least_squares_with_a_shared_random_walk(depths):
+    """Two samples share the error of the way that both are carried, that of the later one."""
+    wander, variance = np.array(depths).T
+    carried = np.cumsum(wander[::-1])[::-1]
+    C = np.minimum.outer(carried, carried) + np.diag(variance)
+    ones = np.ones(len(variance))
+    expected = np.linalg.solve(C, ones) / (ones @ np.linalg.solve(C, ones))
+    weights, mean_variance = weights_at_end(variance, wander)
+    assert weights == pytest.approx(expected, rel=1e-6, abs=1e-9)
+    assert mean_variance == pytest.approx(1 / (ones @ np.linalg.solve(C, ones)), rel=1e-6)

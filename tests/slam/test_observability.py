@@ -12,6 +12,7 @@ from gtsam.symbol_shorthand import L, X
 
 from sonar_graph.errors import EstimatorError, MeasurementError
 from sonar_graph.measurements import Measurements
+from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 from sonar_graph.slam import Isam2
@@ -83,9 +84,8 @@ def without(row: int, sensor: str = "detections") -> Sequence:
 
 
 def run(sequence: Sequence, history: str = "whole") -> tuple[Isam2, list[Estimate]]:
-    estimator = Isam2(
-        sequence.calibration, isam2_params(history__policy=history, smoother__lag_s=8.0, smoother__waiting_gain=0.0)
-    )
+    params = isam2_params(history__policy=history, smoother__lag_s=8.0, smoother__waiting_gain=0.0)
+    estimator = Isam2(sequence.calibration, Odometry(sequence.calibration), params)
     return estimator, estimates_of(estimator, sequence, 1.0)
 
 
@@ -127,7 +127,7 @@ def test_a_row_that_is_no_measurement_is_refused_and_changes_nothing(sensor, col
 
 
 def test_depths_that_run_back_are_refused_by_name_and_change_nothing():
-    fine, late = Isam2(mission().calibration), Isam2(mission().calibration)
+    fine, late = (Isam2(mission().calibration, Odometry(mission().calibration)) for _ in range(2))
     for step in mission().replay(mission().instants(0.5)):
         half_ns = (step.depth.stamps_ns[0] + step.depth.stamps_ns[-1]) // 2
         parts = step.depth.between(0, half_ns), step.depth.between(half_ns, step.end_ns)

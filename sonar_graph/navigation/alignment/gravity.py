@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from sonar_graph.calibration import Calibration, ImuCalibration
 from sonar_graph.errors import AlignmentError
 from sonar_graph.measurements import Floats, Imu
-from sonar_graph.navigation.motion import PreintegratedMotion
+from sonar_graph.motion import PreintegratedMotion
 from sonar_graph.numerics import compiled
 
 LEAST_GYRO_NOISE_DENSITY = 1e-7

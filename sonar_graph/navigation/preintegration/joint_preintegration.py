@@ -24,8 +24,8 @@ import numpy as np
 from sonar_graph.calibration import SHORTEST_HOLE_S, Calibration
 from sonar_graph.errors import CalibrationError, MeasurementError
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints
+from sonar_graph.motion import PreintegratedMotion
 from sonar_graph.navigation.imu_gaps import row_after_hole
-from sonar_graph.navigation.motion import PreintegratedMotion
 from sonar_graph.navigation.preintegration.joint_recursion import LONG_S, RULES, DopplerRule, Inertial, preintegrate
 from sonar_graph.navigation.preintegration.preintegrator import float_triple
 from sonar_graph.navigation.samples import (

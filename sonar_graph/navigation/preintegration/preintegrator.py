@@ -27,7 +27,7 @@ import numpy as np
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import CalibrationError
 from sonar_graph.measurements import Floats
-from sonar_graph.navigation.motion import PreintegratedMotion
+from sonar_graph.motion import PreintegratedMotion
 from sonar_graph.navigation.preintegration.dvl_gaps import GapValues, bridge, gap_values
 from sonar_graph.navigation.preintegration.recursion import Columns, Steps, in_last_frame, integrate_steps, trace_point
 from sonar_graph.navigation.samples import finite_vector, require_noise
