@@ -16,11 +16,14 @@ as white noise; an open one gets the growth since its last row. Errors about the
 Derivation and what is left out: docs/theory/gaps.md.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from sonar_graph.calibration import HOLE_INTERVALS, ROWS_BEFORE, SHORTEST_HOLE_S, UNTYPICAL_S, ImuCalibration
 from sonar_graph.measurements import Ints
 from sonar_graph.numerics import ZERO, Vector, compiled, inlined, plus, scaled
+from sonar_graph.numerics.matrices import Vec3
 
 UNTYPICAL_NS = round(UNTYPICAL_S * 1e9)
 UNFELT_NS = 100_000_000
@@ -108,6 +111,62 @@ def hole_psd(turns: TurnValues, stamps: Ints, row: int, length_s: float, step_s:
         open_variance(z, c_z, length_s) - open_variance(z, c_z, before_s),
     )
     return plus(scaled(1.0 / step_s, grown), (by_row, by_row, by_row))
+
+
+class Turns(NamedTuple):
+    """How a vehicle turns unseen in holes of its IMU."""
+
+    is_modelled: bool
+    sigma: Vec3
+    """Of the rate about each body axis, rad/s."""
+    time_s: Vec3
+    """Its time."""
+    gyro_density: float
+    """rad/s/√Hz."""
+
+
+def turns_of(imu: ImuCalibration) -> Turns:
+    """The numbers of a calibration."""
+    is_modelled = any(sigma > 0 for sigma in imu.turn_sigma_rad_s)
+    return Turns(is_modelled, Vec3(*imu.turn_sigma_rad_s), Vec3(*imu.turn_time_s), imu.gyro_noise_density)
+
+
+@compiled
+def typical_ns(stamps: Ints, row: int) -> int:
+    """Median of the `ROWS_BEFORE` intervals before a row, of an even number the shorter; 0 where there is none."""
+    first = max(row - ROWS_BEFORE, 0)
+    for k in range(first, row):
+        shorter = same = 0
+        for m in range(first, row):
+            shorter += int(stamps[m + 1] - stamps[m] < stamps[k + 1] - stamps[k])
+            same += int(stamps[m + 1] - stamps[m] == stamps[k + 1] - stamps[k])
+        if 2 * shorter < row - first <= 2 * (shorter + same):
+            return stamps[k + 1] - stamps[k]
+    return 0
+
+
+@compiled
+def error_in_hole(turns: Turns, stamps: Ints, rows: int, row: int, t: int, until_ns: int) -> Vec3:
+    """Spectral density of the rates' error: the mean over a closed hole, the growth of an open one since t; rad²/s."""
+    last, n2 = min(row, rows) - 1, turns.gyro_density**2
+    typical_s = typical_ns(stamps, last) * 1e-9
+    by_row = n2 / typical_s if typical_s > 0.0 else 0.0
+    s, c = turns.sigma, turns.time_s
+    if row < rows:
+        T = (stamps[row] - stamps[last]) * 1e-9
+        grown = Vec3(closed_variance(s.x, c.x, T), closed_variance(s.y, c.y, T), closed_variance(s.z, c.z, T))
+        return (1.0 / T) * grown + 0.5 * by_row * T * ONES
+    T, before_s = (until_ns - stamps[last]) * 1e-9, (t - stamps[last]) * 1e-9
+    grown = Vec3(open_variance(s.x, c.x, T), open_variance(s.y, c.y, T), open_variance(s.z, c.z, T))
+    grown -= Vec3(
+        open_variance(s.x, c.x, before_s), open_variance(s.y, c.y, before_s), open_variance(s.z, c.z, before_s)
+    )
+    return (1.0 / (T - before_s)) * grown + by_row * (T + before_s) * ONES
+
+
+ONES = Vec3(1.0, 1.0, 1.0)
+UNTURNED = Turns(False, ONES, ONES, 0.0)
+"""With it no interval is a hole."""
 
 
 @compiled

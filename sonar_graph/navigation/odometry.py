@@ -26,7 +26,7 @@ from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints
 from sonar_graph.motion import Motions, PreintegratedMotion
 from sonar_graph.navigation.dvl_screening import RowIntake
-from sonar_graph.navigation.imu_gaps import NO_TURNS, turn_values
+from sonar_graph.navigation.imu_gaps import NO_TURNS, UNTURNED, turn_values, turns_of
 from sonar_graph.navigation.preintegration import (
     Columns,
     Preintegrator,
@@ -34,6 +34,8 @@ from sonar_graph.navigation.preintegration import (
     are_nodes,
     merge_rows,
 )
+from sonar_graph.navigation.preintegration.steps import Rows, steps_over
+from sonar_graph.navigation.preintegration.sums import motions_over
 from sonar_graph.navigation.samples import (
     EARLIEST_NS,
     WINDOW_NS,
@@ -45,6 +47,8 @@ from sonar_graph.navigation.samples import (
     value_at,
 )
 from sonar_graph.states import RefusedRow
+
+ZERO_RATE = np.zeros(3)
 
 
 class Odometry:
@@ -81,6 +85,7 @@ class Odometry:
         self._imu, self._dvl = self._intake.imu, self._intake.dvl
         self._hold_past = calibration.odometry_interpolation == "hold-past"
         self._turns = NO_TURNS if self._hold_past else turn_values(calibration.imu)
+        self._turn_model = UNTURNED if self._hold_past else turns_of(calibration.imu)
         self._longest_ns = longest_interval_ns(calibration)
         self._preintegrator = Preintegrator.from_calibration(calibration)
         latitude = calibration.earth_rate_latitude_rad
@@ -258,24 +263,13 @@ class Odometry:
 
     def motions(self, start_ns: Ints, end_ns: Ints, known_ns: Ints, bias: Floats) -> Motions:
         """Motions over intervals, each from rows stamped no later than its ``known_ns``."""
-        imu_ns, dvl_ns = self._imu.stamps_ns, self._dvl.stamps_ns
-        found = []
-        for start, end, known in zip(start_ns.tolist(), end_ns.tolist(), known_ns.tolist(), strict=True):
-            inside = np.r_[start, dvl_ns[(dvl_ns > start) & (dvl_ns <= min(end, known))], end]
-            if np.diff(inside).max() > self._longest_ns:
-                nothing = (np.full(s, np.nan) for s in ((3, 3), 3, (6, 6), (6, 3), 3))
-                found.append(tuple(nothing))
-                continue
-            imu_rows, dvl_rows = (int(np.searchsorted(stamps, known, side="right")) for stamps in (imu_ns, dvl_ns))
-            motion = self._preintegrator.integrate(
-                Steps(*merge_rows(self.columns(), imu_rows, dvl_rows, start, end)), bias
-            )
-            pose = motion.i_T_j
-            impulse = motion.mean_specific_force * motion.duration_s if end > start else np.zeros(3)
-            found.append((pose.rotation().matrix(), pose.translation(), motion.covariance, motion.D_bias, impulse))
-        shapes = (-1, 3, 3), (-1, 3), (-1, 6, 6), (-1, 6, 3), (-1, 3)
-        columns = zip(*found, strict=True) if found else [()] * 5
-        return Motions(*(np.array(column).reshape(shape) for column, shape in zip(columns, shapes, strict=True)))
+        sensors = self._preintegrator
+        steps = steps_over(self._rows(), start_ns, end_ns, known_ns, self._longest_ns)
+        return motions_over(*steps, bias, ZERO_RATE, sensors.body_p_dvl, sensors.gyro_noise_density)
+
+    def _rows(self) -> Rows:
+        imu, dvl = self._imu, self._dvl
+        return Rows(imu.stamps_ns, *imu.values, dvl.stamps_ns, *dvl.values, self._hold_past, self._turn_model)
 
     def velocity_at_imu(self, epoch_ns: int) -> tuple[Floats, float]:
         """Velocity of the IMU's point at an epoch, body axes, shape (3,), m/s, and the variance of one component."""

@@ -1,0 +1,78 @@
+"""Preintegration of steps: mean, covariance and bias derivative as sums.
+
+Step k has duration dt, rate w, velocity v of the Doppler log at l in the body, noise densities n_g (gyros) and Q_k
+(velocity). With E the Earth's rate in frame i, `Exp` and its mean `J_l`::
+
+    w_k = w - b - R^T E,    R_k = R J_l(w_k dt),    s = dt R_k (v - w_k x l)
+    A_k = Ad(R_k, p + s / 2) [I 0; [l]x I] = [R_k 0; M R_k],    M = [p + s / 2]x R_k + R_k [l]x
+    C_i = sum_k dt A_k diag(n_g^2 I, Q_k) A_k^T,    D_i = -sum_k dt A_k[:, :3]
+    p <- p + s,    R <- R Exp(w_k dt)
+
+A noise of step k reaches the end through the adjoint of the pose in the middle of the step; errors kept in frame i are
+not transported from step to step. One adjoint at the end takes both to frame j: ``C = Ad(j_T_i) C_i Ad(j_T_i)^T``.
+docs/theory/preintegration.md.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sonar_graph.measurements import Floats, Ints
+from sonar_graph.motion import Motions
+from sonar_graph.navigation.preintegration.steps import Steps, put
+from sonar_graph.numerics.jit import compiled
+from sonar_graph.numerics.matrices import (
+    I3,
+    O3,
+    ZERO,
+    Mat6,
+    cross,
+    diagonal,
+    exp_and_mean,
+    inverse_adjoint,
+    mat,
+    skew,
+    store,
+    store6,
+    vec,
+)
+
+
+@compiled
+def motions_over(
+    first: Ints, steps: Steps, bias: Floats, earth: Floats, body_p_dvl: Floats, gyro_density: float
+) -> Motions:
+    """Motions over intervals, each of steps ``first[e]`` to ``first[e + 1]``.
+
+    Removed are the gyro bias (body frame) and the Earth's rotation (frame i), rad/s.
+    """
+    n, b, E, arm = len(first) - 1, vec(bias), vec(earth), vec(body_p_dvl)
+    dR, dp, impulse = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3))
+    C, D = np.empty((n, 6, 6)), np.empty((n, 6, 3))
+    N = gyro_density**2 * I3
+    for e in range(n):
+        R, p, f, tt, rt, rr, D_t, D_r = I3, ZERO, ZERO, O3, O3, O3, O3, O3
+        for k in range(first[e], first[e + 1]):
+            dt, w, v = steps.duration_s[k], vec(steps.rate[k]) - b - R.T @ E, vec(steps.velocity[k])
+            N_g, Q = N + diagonal(vec(steps.turn_psd[k])), mat(steps.velocity_psd[k])
+            turn, mean = exp_and_mean(dt * w)
+            R_k = R @ mean
+            s = dt * (R_k @ (v - cross(w, arm)))
+            M = skew(p + 0.5 * s) @ R_k + R_k @ skew(arm)
+            RN, MN = R_k @ N_g, M @ N_g
+            tt += dt * (RN @ R_k.T)
+            rt += dt * (MN @ R_k.T)
+            rr += dt * (MN @ M.T + R_k @ Q @ R_k.T)
+            D_t, D_r = D_t - dt * R_k, D_r - dt * M
+            f += dt * (R_k @ vec(steps.force[k]))
+            p, R = p + s, R @ turn
+        to_j = inverse_adjoint(R, p)
+        C_i = Mat6(tt, rt.T, rt, rr)
+        D_j = to_j @ Mat6(D_t, O3, D_r, O3)
+        store(R, dR[e], 0, 0)
+        put(p, dp, e)
+        put(f, impulse, e)
+        store6(to_j @ C_i @ to_j.T, C[e])
+        store(D_j.a, D[e], 0, 0)
+        store(D_j.c, D[e], 3, 0)
+    return Motions(dR, dp, C, D, impulse)
