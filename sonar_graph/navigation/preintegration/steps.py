@@ -90,14 +90,12 @@ def velocity_noise(rows: Rows, n: int, k: int) -> Mat3:
 
 @inlined
 def has_gap(dvl_ns: Ints, n: int, k: int, start_ns: int, end_ns: int, longest_ns: int) -> bool:
-    """True where an interval touches a time longer than that between samples, of which the first n are known."""
-    t = dvl_ns[k - 1] if k > 0 else start_ns
-    while t < end_ns:
-        until = dvl_ns[k] if k < n else end_ns
-        if until - t > longest_ns:
+    """True where an interval, with row k the first Doppler row in it, has a longer time without any of the first n."""
+    while k < n and dvl_ns[k] < end_ns:
+        if dvl_ns[k] - start_ns > longest_ns:
             return True
-        t, k = until, k + 1
-    return False
+        start_ns, k = dvl_ns[k], k + 1
+    return end_ns - start_ns > longest_ns
 
 
 @inlined
