@@ -20,7 +20,6 @@ import numpy as np
 from baselines.filter_window import NODE, OPENED, GravityInterval, VehicleModel
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.navigation import rows_until, value_at
-from sonar_graph.navigation.alignment import tilt_sigma, up_direction
 from sonar_graph.navigation.preintegration import (
     NO_MOTION,
     Columns,
@@ -221,6 +220,40 @@ def _integrate_with_bias(
         D_t, D_r = extended_by_bias(D_t, D_r, step, added)
         motion = extended(motion, step, added, vehicle.gyro_noise_density)
     return GapMotion(_finished(motion), D_t, D_r)
+
+
+@compiled
+def up_direction(
+    mean_force: Floats, i_R_j: Floats, velocity_i: Floats, velocity_j: Floats, duration_s: float
+) -> Floats:
+    """up_j of the module's equation, shape (3,); NaN where the force is not measured."""
+    up_i = np.empty(3)
+    for r in range(3):
+        turned = i_R_j[r, 0] * velocity_j[0] + i_R_j[r, 1] * velocity_j[1] + i_R_j[r, 2] * velocity_j[2]
+        up_i[r] = mean_force[r] - (turned - velocity_i[r]) / duration_s
+    length = math.sqrt(up_i[0] ** 2 + up_i[1] ** 2 + up_i[2] ** 2)
+    up_j = np.empty(3)
+    for c in range(3):
+        up_j[c] = (i_R_j[0, c] * up_i[0] + i_R_j[1, c] * up_i[1] + i_R_j[2, c] * up_i[2]) / length
+    return up_j
+
+
+@compiled
+def tilt_sigma(
+    duration_s: float,
+    velocity_sigma_m_s: float,
+    accel_noise_density: float,
+    accel_bias_sigma: float,
+    gyro_noise_density: float,
+    gyro_bias_sigma: float,
+    gravity: float,
+) -> float:
+    """Standard deviation of the direction's tilt, rad."""
+    noise = (accel_noise_density**2 / duration_s + 2.0 * (velocity_sigma_m_s / duration_s) ** 2) / gravity**2
+    noise += gyro_noise_density**2 * duration_s / 3.0 + (gyro_bias_sigma * duration_s) ** 2 / 4.0
+    beta = accel_bias_sigma / gravity
+    tau_s = (beta / max(gyro_noise_density, 1e-7)) ** 2
+    return math.sqrt(noise + beta**2 * max(1.0, tau_s / duration_s))
 
 
 @compiled

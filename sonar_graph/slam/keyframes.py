@@ -11,7 +11,6 @@ ranges. NaN is sound: the log does not know the noise, and the calibration does.
 from bisect import bisect_left
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import TypeVar
 
 import gtsam
 import numpy as np
@@ -22,7 +21,6 @@ from pydantic import Field
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.measurements import Depth, Dvl, Floats, Imu, LandmarkDetections, possible_ranges
 from sonar_graph.motion import MotionSource, PreintegratedMotion
-from sonar_graph.navigation import in_numbers
 from sonar_graph.navigation.alignment import gravity_direction
 from sonar_graph.numerics import compiled
 from sonar_graph.slam.models import factors
@@ -77,7 +75,6 @@ def positive_definite(covs: Floats) -> Flags:
 S_PER_NS = 1e-9
 CARRIED_IN_GAP_NS = 300_000_000
 """Longest time over which a depth sample is carried straight on over the end of a gap."""
-Rows = TypeVar("Rows", Dvl, Depth)
 EARLIEST_NS, LATEST_NS = np.iinfo(np.int64).min, np.iinfo(np.int64).max
 
 
@@ -139,12 +136,12 @@ class Keyframes:
         return X(bisect_left(self.stamps_ns, self.stamps_ns[-1] - round(age_s / S_PER_NS)))
 
     def add(self, imu: Imu | None, dvl: Dvl | None, depth: Depth | None) -> None:
-        """Take in rows; refuse unsound ones, and depths older than those that wait."""
-        if dvl is not None:  # an infinite variance is sound: that axis was not measured
-            dvl = self._sound("dvl", dvl, positive_definite(in_numbers(dvl.velocity_cov, np.eye(3))))
+        """Take in rows; refuse unsound depths, and those older than others that wait."""
         if depth is not None:
-            variance = np.where(np.isnan(depth.variance_m2), 1.0, depth.variance_m2)
-            depth = self._sound("depth", depth, (variance > 0) & np.isfinite(variance))
+            is_sound = np.isnan(depth.variance_m2) | ((depth.variance_m2 > 0) & np.isfinite(depth.variance_m2))
+            unsound = depth.stamps_ns[~is_sound].tolist()
+            self._refused += [RefusedRow("depth", stamp_ns, Refusal.UNSOUND, np.nan) for stamp_ns in unsound]
+            depth = depth if not unsound else depth.rows(is_sound) if is_sound.any() else None
         self.odometry.add(imu, dvl)
         self._latest = None
         newest_ns = self._depths[-1].stamps_ns[-1] if self._depths else EARLIEST_NS
@@ -153,14 +150,6 @@ class Keyframes:
             self._refused += [RefusedRow("depth", stamp_ns, Refusal.LATE, np.nan) for stamp_ns in late.tolist()]
         if depth is not None and (in_order := depth.between(newest_ns, LATEST_NS)):
             self._depths.append(in_order)
-
-    def _sound(self, sensor: str, rows: Rows, is_sound: NDArray[np.bool_]) -> Rows | None:
-        """Rows that can be measurements; the others are refused."""
-        if is_sound.all():
-            return rows
-        unsound = rows.stamps_ns[~is_sound].tolist()
-        self._refused += [RefusedRow(sensor, stamp_ns, Refusal.UNSOUND, np.nan) for stamp_ns in unsound]
-        return rows.rows(is_sound) if is_sound.any() else None
 
     @property
     def refused(self) -> list[RefusedRow]:

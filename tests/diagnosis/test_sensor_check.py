@@ -13,8 +13,8 @@ from sonar_graph.diagnosis import sensor_check
 from sonar_graph.diagnosis.findings import Finding, StartTilt, find_start_tilt
 from sonar_graph.logs.adapters.log_config import LogConfig
 from sonar_graph.measurements import Dvl, Floats, Imu
+from sonar_graph.navigation.alignment import InitialTilt
 from sonar_graph.navigation.alignment.dvl_imu import DvlMatch
-from sonar_graph.navigation.alignment.gravity import InitialTilt
 from sonar_graph.navigation.alignment.time_offset import Estimate1D
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission

@@ -14,17 +14,16 @@ from sonar_graph.errors import AlignmentError
 from sonar_graph.measurements import Dvl, Floats, Imu
 from sonar_graph.navigation import PreintegratedMotion, Preintegrator
 from sonar_graph.navigation.alignment.allan import allan_deviation, degrees_of_freedom, density, noise_densities
-from sonar_graph.navigation.alignment.at_rest import align_at_rest, covariance_at_rest
-from sonar_graph.navigation.alignment.gravity import (
+from sonar_graph.navigation.alignment.at_rest import (
     InitialTilt,
+    align_at_rest,
     angles_by_up,
-    earth_rate_in_world,
+    covariance_at_rest,
     earth_up_and_level,
-    gravity_direction,
     in_body_axes,
     roll_and_pitch,
-    velocity_at_imu,
 )
+from sonar_graph.navigation.alignment.gravity import earth_rate_in_world, gravity_direction, velocity_at_imu
 from sonar_graph.navigation.preintegration.recursion import Steps
 from sonar_graph.testing import check_consistent
 

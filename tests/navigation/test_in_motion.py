@@ -12,7 +12,7 @@ from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration,
 from sonar_graph.errors import AlignmentError
 from sonar_graph.logs.convert.akit import read_akit
 from sonar_graph.measurements import Dvl, Floats, Imu
-from sonar_graph.navigation.alignment.gravity import InitialTilt
+from sonar_graph.navigation.alignment import InitialTilt
 from sonar_graph.navigation.alignment.in_motion import align_in_motion
 from sonar_graph.testing import check_consistent
 

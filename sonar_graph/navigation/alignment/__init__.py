@@ -2,10 +2,10 @@
 
 # fmt: off
 from sonar_graph.navigation.alignment.allan import longest_rest, noise_densities
-from sonar_graph.navigation.alignment.at_rest import align_at_rest
+from sonar_graph.navigation.alignment.at_rest import InitialTilt, align_at_rest
 from sonar_graph.navigation.alignment.dvl_imu import DvlMatch, Estimates3D, match_dvl_to_imu
 from sonar_graph.navigation.alignment.gravity import (
-    InitialTilt, earth_rate_in_world, gravity_direction, tilt_sigma, up_direction, velocity_at_imu,
+    earth_rate_in_world, gravity_direction, tilt_sigma, up_direction, velocity_at_imu,
 )
 from sonar_graph.navigation.alignment.in_motion import LONGEST_S, align_in_motion, until_hole
 from sonar_graph.navigation.alignment.reference_offset import match_reference_to_imu

@@ -9,22 +9,72 @@ rest, u the world's up in body axes, b_a and b_g the biases, a and N the noise d
 Hence ``u = mean f / |mean f|`` with the variance ``(sigma_a^2 + a^2 / T) / g^2`` across u, and at the end of the rest
 ``b_g = mean w - Omega sin(phi) u``. Without a latitude the bias includes the Earth's rotation, which is not in the
 covariance. docs/theory/alignment.md; coarse levelling: P. D. Groves, Principles of GNSS, Inertial, and Multisensor
-Integrated Navigation Systems, 2nd ed., 2013, chapter 5.6.
+Integrated Navigation Systems, 2nd ed., 2013, chapter 5.6. Roll r and pitch p follow from ``up = (-sin p, sin r cos p,
+cos r cos p)``.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import AlignmentError
 from sonar_graph.measurements import Dvl, Floats, Imu
-from sonar_graph.navigation.alignment.gravity import (
-    InitialTilt,
-    angles_by_up,
-    earth_up_and_level,
-    in_body_axes,
-    roll_and_pitch,
-)
+from sonar_graph.navigation.alignment.gravity import earth_rate_in_world
+
+LEAST_COSINE = 1e-3
+"""Least cosine of pitch; roll has no meaning with the nose straight up or down."""
+
+
+@dataclass(frozen=True, eq=False)
+class InitialTilt:
+    """Roll, pitch and gyro bias at one instant, with their joint covariance."""
+
+    stamp_ns: int
+    """When it holds."""
+    roll_rad: float
+    pitch_rad: float
+    gyro_bias: Floats
+    """Body axes, shape (3,), rad/s."""
+    covariance: Floats
+    """Of [roll, pitch, gyro bias], shape (5, 5)."""
+    bias_is_observed: NDArray[np.bool_]
+    """True for the axes whose bias the data tell better than the prior, shape (3,)."""
+
+
+def roll_and_pitch(up: Floats) -> tuple[float, float]:
+    """Roll and pitch (rad) from the world's up in body axes, of any length, shape (3,)."""
+    return float(np.arctan2(up[1], up[2])), float(np.arctan2(-up[0], np.hypot(up[1], up[2])))
+
+
+def angles_by_up(up: Floats) -> Floats:
+    """Derivative of roll and pitch by up, shape (2, 3); raises AlignmentError for a nose straight up or down."""
+    x, y, z = up.tolist()
+    cosine = np.hypot(y, z)
+    if cosine < LEAST_COSINE:
+        raise AlignmentError("alignment: the nose points straight up or down, where roll has no meaning")
+    by_roll = np.array([0.0, z, -y]) / cosine**2
+    by_pitch = np.array([-cosine, x * y / cosine, x * z / cosine])
+    return np.stack([by_roll, by_pitch])
+
+
+def earth_up_and_level(calibration: Calibration) -> tuple[float, float]:
+    """Earth's rate along up and along north, rad/s; zero without a latitude."""
+    earth = earth_rate_in_world(calibration)
+    return (0.0, 0.0) if earth is None else (float(earth[2]), float(earth[1]))
+
+
+def in_body_axes(imu: Imu, calibration: Calibration) -> Imu:
+    """Turn readings into body axes; raises AlignmentError where a specific force was not measured."""
+    if not np.isfinite(imu.specific_force).all():
+        raise AlignmentError(
+            "Imu.specific_force: is not finite in every row; alignment needs accelerometers throughout"
+        )
+    body_R_imu = calibration.imu.mounting.pose().rotation().matrix()
+    return Imu(imu.stamps_ns, imu.angular_velocity @ body_R_imu.T, imu.specific_force @ body_R_imu.T)
+
 
 BLOCK_S = 0.5
 """Means over this time are compared, so that vibration is not taken for motion."""

@@ -29,7 +29,7 @@ from threadpoolctl import threadpool_limits
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints
-from sonar_graph.navigation.alignment.gravity import in_body_axes
+from sonar_graph.navigation.alignment.at_rest import in_body_axes
 from sonar_graph.navigation.alignment.time_offset import RANGE_S, Estimate1D, SampleSeries, search_offset
 from sonar_graph.navigation.imu_gaps import UNFELT_NS, row_after_hole
 from sonar_graph.navigation.samples import is_partial

@@ -29,14 +29,14 @@ from scipy.stats import chi2
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import AlignmentError
 from sonar_graph.measurements import Dvl, Floats, Imu
-from sonar_graph.navigation.alignment.dvl_imu import InertialPath, cross_matrices
-from sonar_graph.navigation.alignment.gravity import (
+from sonar_graph.navigation.alignment.at_rest import (
     InitialTilt,
     angles_by_up,
     earth_up_and_level,
     in_body_axes,
     roll_and_pitch,
 )
+from sonar_graph.navigation.alignment.dvl_imu import InertialPath, cross_matrices
 from sonar_graph.navigation.imu_gaps import UNFELT_NS, row_after_hole
 from sonar_graph.navigation.samples import in_numbers, is_partial
 

@@ -1,9 +1,9 @@
 """Rows of IMU and Doppler log that are used, and the reasons why others are refused.
 
-A row is turned into body axes and placed by its stamp. A row of a motion that was already used is late. A velocity that
-no vehicle reaches is an outlier, and one with none before it waits until others confirm it
-(`sonar_graph.navigation.dvl_screening.dvl_gate`). One of too few beams waits until it can be completed
-(`sonar_graph.navigation.dvl_screening.partial_beams`).
+A row is turned into body axes and placed by its stamp. A velocity whose covariance is not positive definite is unsound,
+a row of a motion that was already used is late. A velocity that no vehicle reaches is an outlier, and one with none
+before it waits until others confirm it (`sonar_graph.navigation.dvl_screening.dvl_gate`). One of too few beams waits
+until it can be completed (`sonar_graph.navigation.dvl_screening.partial_beams`).
 """
 
 from typing import TypeVar
@@ -18,6 +18,8 @@ from sonar_graph.navigation.samples import EARLIEST_NS, LATEST_NS, StampedRows, 
 from sonar_graph.states import Refusal, RefusedRow
 
 _Rows = TypeVar("_Rows", Imu, Dvl)
+ROUNDING = 1e-13
+"""Share of the largest variance below which the smallest is taken for zero."""
 
 
 class RowIntake:
@@ -77,7 +79,17 @@ class RowIntake:
         rows = self._in_time(dvl, self.dvl.stamps_ns, "dvl")
         if rows is None:
             return False
-        velocity, cov = rows.velocity, in_numbers(rows.velocity_cov, self._default_cov)
+        cov = in_numbers(rows.velocity_cov, self._default_cov)
+        if not np.isnan(rows.velocity_cov).all():
+            variances = np.linalg.eigvalsh(cov)
+            is_sound = (variances[:, 0] > ROUNDING * variances[:, 2]) | np.isnan(rows.velocity_cov).all(axis=(1, 2))
+            if not is_sound.all():
+                unsound = rows.stamps_ns[~is_sound].tolist()
+                self._refused += [RefusedRow("dvl", stamp_ns, Refusal.UNSOUND, np.nan) for stamp_ns in unsound]
+                if not is_sound.any():
+                    return False
+                rows, cov = rows.rows(is_sound), cov[is_sound]
+        velocity = rows.velocity
         if self._body_R_dvl is not None:
             velocity, cov = velocity @ self._body_R_dvl.T, self._body_R_dvl @ cov @ self._body_R_dvl.T
         block, confirmation = (rows.stamps_ns, velocity, cov), self._confirmation
