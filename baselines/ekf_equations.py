@@ -4,84 +4,47 @@
 
     x = [X, Y, Z, phi, theta, psi, p_1, ..., p_N]            (4)  p_i: landmark in the world, 3 numbers
     P = [ P_vv  P_vm ; P_vm^T  P_mm ]                        (5)
-    z = h(x_v, p)                                            (6)  range and azimuth
-    e = z_measured - z, azimuth wrapped                      (7)
+    z_hat = h(x_v, p)                                        (6)  range and azimuth
+    e = z - z_hat, azimuth wrapped                           (7)
 
-Prediction over the motion (dR, dp, C) to the next DVL stamp, with ``R = Rz(psi) Ry(theta) Rx(phi)``::
+A motion (dR, dp) leads to the pose ``R' = R dR, X' = X + R dp``, with ``R = Rz(psi) Ry(theta) Rx(phi)``. C is the
+covariance of its perturbation [theta, rho] in its last frame. All that is measured depends on the perturbation delta of
+the pose after the motion, in the body's own axes, to which state and motion contribute ::
 
-    X' = X + R dp,  R' = R dR,   P_vv' = F P_vv F^T + G C G^T,  P_vm' = F P_vm
-    F = [ I  -R [dp]x W  ]      G = [ 0         R ]
-        [ 0   E' dR^T W  ]          [ E' dR^T   0 ]
+    delta = T dx_v + [theta; rho],      T = [ 0           dR^T W           ]
+                                            [ dR^T R^T   -dR^T [dp]x W     ]
 
-Everything measured is a function of how far a point s of the body, a provisional motion after the state, moves along a
-direction n (both in the axes of the state's body)::
-
-    row(n, s) = [ (R n)^T   (s x n)^T W | ((s - dp) x n)^T   n^T ]     by X, (phi, theta, psi) | theta_i, eps
-
-Update: ``S = H P H^T + R_z + H_m C H_m^T``, with ``H_v | H_m = row(-n, p_n)`` and ``H_p = (R n)^T`` for n of range and
-azimuth each (`baselines.sonar_update`). Augmentation by a new landmark at ``g = X + R s``, with
-``G_v | G_m = row(n, s)`` for the world's three axes n::
-
-    P_pv = G_v P_v.,   P_pp = G_v P_vv G_v^T + G_m C G_m^T + G_z diag(R_z, elevation_sigma^2) G_z^T
-
-W, E: `sonar_graph.numerics`. Arrays have room for more landmarks than there are; ``n`` is the length of the state.
-Derivation and the choices the paper leaves open: docs/theory/ekf_slam.md.
+A point q of the body moves by ``R' (rho - [q]x theta)``: along a direction n, in body axes, ``H_b = [(q x n)^T, n^T]``.
+W, E: `sonar_graph.numerics.matrices`. Derivation and the choices the paper leaves open: docs/theory/ekf_slam.md.
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
-from baselines.sonar_update import (
-    GATED,
-    NEW,
-    NO_SLOT,
-    PASSED_OVER,
-    USED,
-    DetectionRow,
-    Frame,
-    SonarModel,
-    correct_jointly,
-    detection_row,
-    elevation_of_new,
-    far_polar_covariance,
-    is_beyond_linear,
-    is_inside_gate,
-    point_seen,
-    polar_covariance,
-    predicted_view,
-    range_azimuth_jacobian,
-)
+from baselines.filter import Motion, SonarModel, far_view, polar_covariance
 from sonar_graph.measurements import Floats
-from sonar_graph.navigation.preintegration import Integral
-from sonar_graph.numerics import (
-    Matrix,
-    Vector,
-    compiled,
+from sonar_graph.numerics import compiled, inlined
+from sonar_graph.numerics.matrices import (
+    I3,
+    O3,
+    Mat3,
+    Mat6,
+    Vec3,
+    Vec6,
+    body_rates_from_euler,
     cross,
-    dot,
-    euler_from_rates,
     euler_from_rotation,
-    inlined,
-    matrix,
-    minus,
-    place,
-    plus,
-    product,
-    rates_from_euler,
+    euler_rates_from_body,
+    mat,
+    mat6,
     rotation_from_euler,
-    sandwich,
-    scaled,
-    skew_times,
-    sum_of,
-    symmetric,
-    times,
-    transformed,
-    transposed,
-    vector,
+    skew,
+    store,
+    store6,
+    vec,
 )
-from sonar_graph.slam.models import FLOOR_GATE, sonar_point_jacobian, wrap_angle
+from sonar_graph.slam.models import FLOOR_GATE, sonar_point, sonar_point_jacobian, wrap_angle
 
 POSE = 6
 """Length of x_v."""
@@ -89,327 +52,218 @@ LANDMARK = 3
 """Length of p_i."""
 
 
-@inlined
-def predict(x: Floats, P: Floats, n: int, motion: Integral) -> None:
-    """Carry state and covariance over a motion, with ``F = [[I, A], [0, B]]`` on the pose."""
-    angles = vector(x[3:])
-    R, W = rotation_from_euler(angles), rates_from_euler(angles)
-    angles_after = euler_from_rotation(product(R, motion.dR))
-    E_dR = product(euler_from_rates(angles_after), transposed(motion.dR))
-    A, B = product(R, skew_times(scaled(-1.0, motion.dp), W)), product(E_dR, W)
-    _set_triple(x, 0, transformed(vector(x), R, motion.dp))
-    _set_triple(x, 3, angles_after)
-    XX, XE, EE = matrix(P[:, :3]), matrix(P[:, 3:]), matrix(P[3:, 3:])
-    XE_carried = sum_of(XE, product(A, EE))
-    XX = sum_of(sum_of(XX, product(XE_carried, transposed(A))), product(A, transposed(XE)))
-    XX = sum_of(XX, sandwich(R, motion.cov_rr, R))
-    XE = sum_of(product(XE_carried, transposed(B)), sandwich(R, motion.cov_rt, E_dR))
-    EE = sum_of(sandwich(B, EE, B), sandwich(E_dR, motion.cov_tt, E_dR))
-    _place_symmetric(symmetric(XX), transposed(XE), symmetric(EE), P)
-    for c in range(POSE, n):
-        carried = (P[3, c], P[4, c], P[5, c])
-        column = plus((P[0, c], P[1, c], P[2, c]), times(A, carried)) + times(B, carried)
-        for r in range(POSE):
-            P[r, c] = P[c, r] = column[r]
-
-
-@inlined
-def _place_symmetric(first: Matrix, mixed: Matrix, second: Matrix, out: Floats) -> None:
-    """Write ``[[first, mixed^T], [mixed, second]]``."""
-    place(first, out, 0, 0)
-    place(transposed(mixed), out, 0, 3)
-    place(mixed, out, 3, 0)
-    place(second, out, 3, 3)
-
-
-@inlined
-def pose_after(x: Floats, P: Floats, motion: Integral) -> tuple[Floats, Floats, Floats]:
-    """Pose of the body a motion after the state, with the covariance of its perturbation [theta, rho].
-
-    ``theta = dR^T (W d(angles) + theta_i)`` and ``rho = dR^T (R^T dX - [dp]x W d(angles) + eps)``.
-
-    Returns world_R_body (3, 3), position (3,), covariance (6, 6).
-    """
-    angles = vector(x[3:])
-    R, W = rotation_from_euler(angles), rates_from_euler(angles)
-    V, node_R_world, j_R_i = skew_times(scaled(-1.0, motion.dp), W), transposed(R), transposed(motion.dR)
-    XX, XE, EE = matrix(P[:, :3]), product(node_R_world, matrix(P[:, 3:])), matrix(P[3:, 3:])
-    XE_carried = sum_of(XE, product(V, EE))
-    tt = sum_of(sandwich(W, EE, W), motion.cov_tt)
-    rt = sum_of(product(XE_carried, transposed(W)), motion.cov_rt)
-    rr = sum_of(sandwich(node_R_world, XX, node_R_world), motion.cov_rr)
-    rr = sum_of(rr, sum_of(product(XE_carried, transposed(V)), product(V, transposed(XE))))
-    own = np.empty((POSE, POSE))
-    _place_symmetric(
-        symmetric(sandwich(j_R_i, tt, j_R_i)),
-        sandwich(j_R_i, rt, j_R_i),
-        symmetric(sandwich(j_R_i, rr, j_R_i)),
-        own,
-    )
-    return np.array(product(R, motion.dR)), np.array(transformed(vector(x), R, motion.dp)), own
-
-
-@inlined
-def _set_triple(x: Floats, at: int, value: Vector) -> None:
-    """Write three numbers of the state."""
-    x[at], x[at + 1], x[at + 2] = value
-
-
-@inlined
-def correct(x: Floats, P: Floats, n: int, cross_cov: Floats, S: float, innovation: float) -> None:
-    """Update by one number: ``w = P H^T / sqrt(S)``, ``P <- P - w w^T``, ``x <- x + w innovation / sqrt(S)``.
-
-    The products commute, so that P stays symmetric to the last bit. ``cross_cov`` is ``P H^T`` (n,), overwritten.
-    """
-    root = math.sqrt(S)
-    w, share = cross_cov, innovation / root
-    for i in range(n):
-        w[i] /= root
-    for i in range(n):
-        for j in range(n):
-            P[i, j] -= w[i] * w[j]
-        x[i] += w[i] * share
-    _wrap(x)
-
-
-@inlined
-def correct_pair(x: Floats, P: Floats, n: int, cross_cov: Floats, S: Floats, innovation: Floats) -> None:
-    """Update by two numbers at once: as `correct`, with the Cholesky factor of S (2, 2) in place of the root.
-
-    ``cross_cov`` is ``H P`` (2, n), overwritten.
-    """
-    l_00 = math.sqrt(S[0, 0])
-    l_10 = S[1, 0] / l_00
-    l_11 = math.sqrt(S[1, 1] - l_10 * l_10)
-    first, second = cross_cov[0], cross_cov[1]
-    for i in range(n):
-        first[i] /= l_00
-        second[i] = (second[i] - l_10 * first[i]) / l_11
-    y_0 = innovation[0] / l_00
-    y_1 = (innovation[1] - l_10 * y_0) / l_11
-    for i in range(n):
-        for j in range(n):
-            P[i, j] -= first[i] * first[j] + second[i] * second[j]
-        x[i] += first[i] * y_0 + second[i] * y_1
-    _wrap(x)
+# ------------------------------------------------------------------------------------------------- prediction
 
 
 @compiled
-def correct_by(x: Floats, P: Floats, n: int, cross_cov: Floats, S: Floats, innovation: Floats) -> None:
-    """Update by m numbers at once: as `correct_pair`, with shapes (m, n), (m, m) and (m,)."""
-    correct_jointly(P, n, cross_cov, S, innovation, x)
-    _wrap(x)
+def predict(x: Floats, P: Floats, dR_: Floats, dp_: Floats, C: Floats) -> None:
+    """Carry state and covariance over a motion: ``P_vv <- F P_vv F^T + G C G^T``, ``P_vm <- F P_vm``."""
+    dR, dp, angles = mat(dR_), vec(dp_), vec(x[3:])
+    R, W = rotation_from_euler(angles), body_rates_from_euler(angles)
+    X_after, angles_after = vec(x) + R @ dp, euler_from_rotation(R @ dR)
+    E = euler_rates_from_body(angles_after)
+    F = Mat6(I3, -1.0 * (R @ skew(dp) @ W), O3, E @ dR.T @ W)
+    G = Mat6(O3, R @ dR, E, O3)
+    x[0], x[1], x[2] = X_after
+    x[3], x[4], x[5] = angles_after
+    store6(F @ mat6(P) @ F.T + G @ mat6(C) @ G.T, P)
+    for c in range(POSE, len(x)):
+        P_vc = F @ Vec6(Vec3(P[c, 0], P[c, 1], P[c, 2]), Vec3(P[c, 3], P[c, 4], P[c, 5]))
+        P[c, 0], P[c, 1], P[c, 2] = P_vc.a
+        P[c, 3], P[c, 4], P[c, 5] = P_vc.b
+        for r in range(POSE):
+            P[r, c] = P[c, r]
 
 
-@inlined
-def _wrap(x: Floats) -> None:
-    """Keep roll and yaw in (-pi, pi]."""
+# ------------------------------------------------------------------------------------------------- correction
+
+
+@compiled
+def correct(x: Floats, P: Floats, U: Floats, S: Floats, e: Floats) -> None:
+    """Update by m numbers: ``K = P H^T S^-1``, ``x <- x + K e``, ``P <- P - K S K^T``, from ``U = H P`` (m, n).
+
+    With ``S = L L^T`` and ``V = L^-1 U`` that is ``P - V^T V``, row by row. Both factors of every product commute, so
+    that P stays symmetric to the last bit.
+    """
+    n, L, V, y = len(x), S.copy(), U.copy(), e.copy()
+    for r in range(len(e)):
+        for c in range(r):
+            L[r, r] -= L[r, c] * L[r, c]
+            y[r] -= L[r, c] * y[c]
+            for i in range(n):
+                V[r, i] -= L[r, c] * V[c, i]
+        L[r, r] = math.sqrt(L[r, r])
+        for k in range(r + 1, len(e)):
+            for c in range(r):
+                L[k, r] -= L[k, c] * L[r, c]
+            L[k, r] /= L[r, r]
+        y[r] /= L[r, r]
+        for i in range(n):
+            V[r, i] /= L[r, r]
+        for i in range(n):
+            x[i] += V[r, i] * y[r]
+            for j in range(n):
+                P[i, j] -= V[r, i] * V[r, j]
     x[3], x[5] = wrap_angle(x[3]), wrap_angle(x[5])
 
 
-class Moment(NamedTuple):
-    """Pose of the state, and the motion from it to the instant of a frame."""
-
-    X: Vector
-    R: Matrix
-    W: Matrix
-    motion: Integral
-
-
-class MeasurementRow(NamedTuple):
-    """Derivative of one number by the pose state and by the motion since."""
-
-    by_X: Vector
-    by_angles: Vector
-    by_theta: Vector
-    by_eps: Vector
-
-
 @compiled
-def moment_after(x: Floats, motion: Integral) -> Moment:
-    """The moment a motion after the state."""
-    angles = vector(x[3:])
-    return Moment(vector(x), rotation_from_euler(angles), rates_from_euler(angles), motion)
+def correct_number(x: Floats, P: Floats, k: int, value: float, variance: float) -> None:
+    """Update by a direct measurement of Z, of an angle, or of a coordinate of a landmark."""
+    U, S, e = np.empty((1, len(x))), np.empty((1, 1)), np.empty(1)
+    for i in range(len(x)):
+        U[0, i] = P[k, i]
+    S[0, 0] = P[k, k] + variance
+    e[0] = wrap_angle(value - x[k]) if 3 <= k < POSE else value - x[k]
+    correct(x, P, U, S, e)
 
 
-@inlined
-def row_along(moment: Moment, n: Vector, s: Vector) -> MeasurementRow:
-    """The derivatives ``row(n, s)``."""
-    by_angles = times(transposed(moment.W), cross(s, n))
-    return MeasurementRow(times(moment.R, n), by_angles, cross(minus(s, moment.motion.dp), n), n)
-
-
-@compiled
-def motion_covariance(motion: Integral, one: MeasurementRow, other: MeasurementRow) -> float:
-    """``H_m cov H_m^T`` of two numbers."""
-    theta = plus(times(motion.cov_tt, other.by_theta), times(transposed(motion.cov_rt), other.by_eps))
-    eps = plus(times(motion.cov_rt, other.by_theta), times(motion.cov_rr, other.by_eps))
-    return dot(one.by_theta, theta) + dot(one.by_eps, eps)
-
-
-@inlined
-def add_covariances(P: Floats, n: int, at: int, factors: Vector, out: Floats) -> None:
-    """``out += factors^T P[at : at + 3]``, shape (n,)."""
-    for k in range(3):
-        factor = factors[k]
-        for c in range(n):
-            out[c] += factor * P[at + k, c]
-
-
-@inlined
-def correct_up(x: Floats, P: Floats, n: int, up: Vector, sigma: float) -> None:
-    """Update roll and pitch by the direction of the world's up in the body."""
+def correct_up(x: Floats, P: Floats, up: Floats, sigma: float) -> None:
+    """Update roll and pitch by the direction of the world's up in the body, with the sigma of its tilt (rad)."""
     level = math.hypot(up[1], up[2])
-    correct_state(x, P, n, 3, math.atan2(up[1], up[2]), (sigma / level) ** 2)
-    correct_state(x, P, n, 4, math.atan2(-up[0], level), sigma**2)
+    correct_number(x, P, 3, math.atan2(up[1], up[2]), (sigma / level) ** 2)
+    correct_number(x, P, 4, math.atan2(-up[0], level), sigma**2)
 
 
 @inlined
-def correct_state(x: Floats, P: Floats, n: int, at: int, value: float, variance: float) -> None:
-    """Update by a direct measurement of Z or of an angle."""
-    innovation = value - x[at] if at < 3 else wrap_angle(value - x[at])
-    correct(x, P, n, P[at, :n].copy(), P[at, at] + variance, innovation)
+def by_state(H_b: Vec6, R: Mat3, W: Mat3, dR: Mat3, dp: Vec3) -> Vec6:
+    """``H_v = H_b T``."""
+    n = dR @ H_b.b
+    return Vec6(R @ n, W.T @ (dR @ H_b.a + cross(dp, n)))
 
 
 @inlined
-def correct_depth(x: Floats, P: Floats, n: int, motion: Integral, port: Vector, z_m: float, variance_m2: float) -> None:
-    """Update by the height of the pressure port, ``(X + R s)_z`` with ``s = dp + dR port``: row(n, s) along up."""
-    moment = moment_after(x, motion)
-    s = transformed(motion.dp, motion.dR, port)
-    row = row_along(moment, moment.R[2], s)
-    U = np.zeros(n)
-    add_covariances(P, n, 0, row.by_X, U)
-    add_covariances(P, n, 3, row.by_angles, U)
-    S = dot(row.by_X, vector(U)) + dot(row.by_angles, vector(U[3:])) + motion_covariance(motion, row, row) + variance_m2
-    correct(x, P, n, U, S, z_m - x[2] - dot(moment.R[2], s))
+def add_row(h: Vec3, P: Floats, at: int, U: Floats, r: int) -> None:
+    """``U[r] += h^T P[at : at + 3]``."""
+    for i in range(len(P)):
+        U[r, i] += h.x * P[at, i] + h.y * P[at + 1, i] + h.z * P[at + 2, i]
 
 
-@inlined
-def augment(x: Floats, P: Floats, n: int, moment: Moment, sonar: SonarModel, seen: DetectionRow) -> None:
-    """Append a landmark where it was seen.
+@compiled
+def correct_depth(
+    x: Floats, P: Floats, dR_: Floats, dp_: Floats, C: Floats, port: Floats, z_m: float, variance: float
+) -> None:
+    """Update by the height of the pressure port q, ``(X' + R' q)_z``: along the body's up, ``n = R'^T e_z``."""
+    dR, dp, angles = mat(dR_), vec(dp_), vec(x[3:])
+    R, W, q = rotation_from_euler(angles), body_rates_from_euler(angles), vec(port)
+    up = (R @ dR).z
+    H_b = Vec6(cross(q, up), up)
+    H_v = by_state(H_b, R, W, dR, dp)
+    U, S, e = np.zeros((1, len(x))), np.empty((1, 1)), np.empty(1)
+    add_row(H_v.a, P, 0, U, 0)
+    add_row(H_v.b, P, 3, U, 0)
+    share = H_v.a @ Vec3(U[0, 0], U[0, 1], U[0, 2]) + H_v.b @ Vec3(U[0, 3], U[0, 4], U[0, 5])
+    S[0, 0] = share + H_b @ (mat6(C) @ H_b) + variance
+    e[0] = z_m - (x[2] + R.z @ dp + up @ q)
+    correct(x, P, U, S, e)
 
-    On a floor of known height its height is measured once, with the variance ``P_pp[z, z] + floor_sigma^2``, unless the
-    floor's gate refuses it: a point far from the floor is something in the water or a false detection.
+
+# ------------------------------------------------------------------------------------------------- observation
+
+
+@compiled
+def observe(
+    x: Floats, P: Floats, at: int, dR_: Floats, dp_: Floats, C: Floats,
+    body_R_sonar: Floats, body_p_sonar: Floats, z: Floats, R_z: Floats, gate: float,
+) -> tuple[bool, Floats, Floats]:  # fmt: skip
+    """Update by range and azimuth of the landmark at ``x[at : at + 3]``, where its innovation is inside the gate.
+
+    Returns whether it was used, e of (7) and its covariance ``S = H P H^T + H_b C H_b^T + R_z``.
     """
-    elevation_rad = elevation_of_new(moment.X, moment.R, moment.motion, sonar, seen.z)
-    point, G, G_z = location(moment, sonar, seen.z, elevation_rad)
-    noise = polar_covariance(seen.R_z, sonar.aperture_rad)
-    own = np.empty((LANDMARK, LANDMARK))
-    place(symmetric(sandwich(G_z, noise, G_z)), own, 0, 0)
-    for r in range(LANDMARK):
-        x[n + r] = point[r]
-        P[n + r, :n] = 0.0
-        add_covariances(P, n, 0, G[r].by_X, P[n + r])
-        add_covariances(P, n, 3, G[r].by_angles, P[n + r])
-        for c in range(n):
-            P[c, n + r] = P[n + r, c]
-    for r in range(LANDMARK):
-        for c in range(r + 1):
-            own[r, c] += motion_covariance(moment.motion, G[r], G[c])
-            own[r, c] += dot(G[c].by_X, vector(P[n + r])) + dot(G[c].by_angles, vector(P[n + r, 3:]))
-            P[n + r, n + c] = P[n + c, n + r] = own[r, c]
-    if sonar.has_floor:
-        n += LANDMARK
-        innovation, S = sonar.floor_z_m - x[n - 1], P[n - 1, n - 1] + sonar.floor_variance_m2
-        if innovation * innovation <= FLOOR_GATE * S:
-            correct(x, P, n, P[n - 1, :n].copy(), S, innovation)
-
-
-@compiled
-def location(
-    moment: Moment, sonar: SonarModel, z: tuple[float, float], elevation_rad: float
-) -> tuple[Vector, tuple[MeasurementRow, MeasurementRow, MeasurementRow], Matrix]:
-    """The point g that a detection shows, its ``G_v | G_m``, and G_z by (range, azimuth, elevation)."""
-    motion = moment.motion
-    s = point_seen(motion, sonar, z, elevation_rad)
-    G = (row_along(moment, moment.R[0], s), row_along(moment, moment.R[1], s), row_along(moment, moment.R[2], s))
-    world_R_sonar = product(product(moment.R, motion.dR), sonar.body_R_sonar)
-    G_z = product(world_R_sonar, matrix(sonar_point_jacobian(z[0], z[1], elevation_rad)))
-    return transformed(moment.X, moment.R, s), G, G_z
-
-
-@compiled
-def observe_rows(x: Floats, P: Floats, n: int, motion: Integral, sonar: SonarModel, frame: Frame) -> int:
-    """Update by the rows of a frame, a motion after the state, one after the other; returns the state's length."""
-    outcomes = frame.outcomes[0]
-    for row in range(frame.first, frame.last):
-        seen, moment = detection_row(frame, row, sonar), moment_after(x, motion)
-        at = POSE + LANDMARK * seen.slot
-        if seen.slot == NO_SLOT:
-            outcomes[row] = PASSED_OVER
-        elif at >= n:
-            augment(x, P, n, moment, sonar, seen)
-            n += LANDMARK
-            outcomes[row] = NEW
-        elif frame.was_lost:
-            outcomes[row] = observe_far(x, P, n, at, moment, sonar, seen)
-        else:
-            outcomes[row] = _observe(x, P, n, at, moment, sonar, seen)
-    return n
-
-
-@compiled
-def observation(moment: Moment, p: Vector, sonar: SonarModel) -> tuple[Floats, MeasurementRow, MeasurementRow]:
-    """(6): predicted range and azimuth (2,), and ``H_v | H_m`` of each; ``H_p`` is the opposite of its ``by_X``."""
-    z, p_n, by_range, by_azimuth = predicted_view(moment.X, moment.R, moment.motion, sonar, p)
-    return z, row_along(moment, scaled(-1.0, by_range), p_n), row_along(moment, scaled(-1.0, by_azimuth), p_n)
-
-
-@inlined
-def _observe(x: Floats, P: Floats, n: int, at: int, moment: Moment, sonar: SonarModel, seen: DetectionRow) -> int:
-    """Update by a landmark of the state where its innovation is inside the gate."""
-    predicted, by_range, by_azimuth = observation(moment, vector(x[at:]), sonar)
-    _, z, R_z, innovation, S = seen
-    innovation[0], innovation[1] = z[0] - predicted[0], wrap_angle(z[1] - predicted[1])  # (7)
-    U = np.zeros((2, n))
-    _add_row_covariances(P, n, at, by_range, U[0])
-    _add_row_covariances(P, n, at, by_azimuth, U[1])
-    motion = moment.motion
-    S[0, 0] = _variance_share(U[0], at, by_range) + R_z[0] + motion_covariance(motion, by_range, by_range)
-    S[0, 1] = _variance_share(U[0], at, by_azimuth) + R_z[1] + motion_covariance(motion, by_range, by_azimuth)
-    S[1, 1] = _variance_share(U[1], at, by_azimuth) + R_z[2] + motion_covariance(motion, by_azimuth, by_azimuth)
+    dR, dp, angles = mat(dR_), vec(dp_), vec(x[3:])
+    R, W, B = rotation_from_euler(angles), body_rates_from_euler(angles), mat(body_R_sonar)
+    p_b = dR.T @ (R.T @ (vec(x[at:]) - vec(x)) - dp)
+    q = B.T @ (p_b - vec(body_p_sonar))
+    level2 = q.x**2 + q.y**2
+    r = math.sqrt(level2 + q.z**2)
+    e, U, S = np.empty(2), np.zeros((2, len(x))), R_z.copy()
+    e[0], e[1] = z[0] - r, wrap_angle(z[1] - math.atan2(q.y, q.x))  # (6), (7)
+    along = B @ ((1.0 / r) * q), B @ Vec3(-q.y / level2, q.x / level2, 0.0)  # p_b moves, range and azimuth grow
+    H_b = Vec6(cross(along[0], p_b), -1.0 * along[0]), Vec6(cross(along[1], p_b), -1.0 * along[1])
+    H_v = by_state(H_b[0], R, W, dR, dp), by_state(H_b[1], R, W, dR, dp)
+    for a in range(2):
+        add_row(H_v[a].a, P, 0, U, a)
+        add_row(H_v[a].b, P, 3, U, a)
+        add_row(-1.0 * H_v[a].a, P, at, U, a)
+    for a in range(2):
+        for b in range(2):
+            along_X = Vec3(U[b, 0] - U[b, at], U[b, 1] - U[b, at + 1], U[b, 2] - U[b, at + 2])
+            S[a, b] += H_v[a].a @ along_X + H_v[a].b @ Vec3(U[b, 3], U[b, 4], U[b, 5]) + H_b[a] @ (mat6(C) @ H_b[b])
     S[1, 0] = S[0, 1]
-    if not is_inside_gate(seen, sonar):
-        return GATED
-    correct_pair(x, P, n, U, S, innovation)
-    return USED
+    squared = (S[1, 1] * e[0] ** 2 - 2.0 * S[0, 1] * e[0] * e[1] + S[0, 0] * e[1] ** 2) / (
+        S[0, 0] * S[1, 1] - S[0, 1] ** 2
+    )
+    is_used = squared <= gate
+    if is_used:
+        correct(x, P, U, S, e)
+    return is_used, e, S
+
+
+# ------------------------------------------------------------------------------------------------- pose, augmentation
 
 
 @compiled
-def observe_far(x: Floats, P: Floats, n: int, at: int, moment: Moment, sonar: SonarModel, seen: DetectionRow) -> int:
-    """Update by a landmark that may be far from where it is predicted, (2) of `baselines.sonar_update`."""
-    _, z, R_z, innovation, S = seen
-    point, G, by_view = location(moment, sonar, z, 0.0)
-    G_z = np.array(by_view)
-    U, cov, missed = np.empty((LANDMARK, n)), np.empty((LANDMARK, LANDMARK)), np.empty(LANDMARK)
-    for r in range(LANDMARK):
-        missed[r], U[r] = point[r] - x[at + r], P[at + r, :n]
-        add_covariances(P, n, 0, scaled(-1.0, G[r].by_X), U[r])
-        add_covariances(P, n, 3, scaled(-1.0, G[r].by_angles), U[r])
-    for r in range(LANDMARK):
-        for c in range(r + 1):
-            share = dot(G[c].by_X, vector(U[r])) + dot(G[c].by_angles, vector(U[r, 3:]))
-            cov[r, c] = cov[c, r] = U[r, at + c] - share + motion_covariance(moment.motion, G[r], G[c])
-    if not is_beyond_linear(cov, G_z, z[0], R_z):
-        return int(_observe(x, P, n, at, moment, sonar, seen))
-    cov += G_z @ far_polar_covariance(z[0], R_z, sonar.aperture_rad) @ G_z.T
-    B = range_azimuth_jacobian(G_z, z[0])
-    innovation[:], S[:] = B @ missed, B @ cov @ B.T
-    if not is_inside_gate(seen, sonar):
-        return GATED
-    correct_by(x, P, n, U, cov, missed)
-    return USED
+def body_after(x: Floats, dR_: Floats, dp_: Floats) -> tuple[Floats, Floats, Floats]:
+    """R' (3, 3), X' (3,) and T (6, 6) of the pose after a motion."""
+    dR, dp, angles = mat(dR_), vec(dp_), vec(x[3:])
+    R, W = rotation_from_euler(angles), body_rates_from_euler(angles)
+    R_after, X_after, T = np.empty((3, 3)), np.empty(3), np.zeros((6, 6))
+    store(R @ dR, R_after, 0, 0)
+    X_after[0], X_after[1], X_after[2] = vec(x) + R @ dp
+    store(dR.T @ W, T, 0, 3)
+    store(dR.T @ R.T, T, 3, 0)
+    store(-1.0 * (dR.T @ skew(dp) @ W), T, 3, 3)
+    return R_after, X_after, T
 
 
-@inlined
-def _add_row_covariances(P: Floats, n: int, at: int, row: MeasurementRow, out: Floats) -> None:
-    """``out += H P`` for a row of H with a landmark, shape (n,); only columns of pose and landmark are not zero."""
-    add_covariances(P, n, 0, row.by_X, out)
-    add_covariances(P, n, 3, row.by_angles, out)
-    add_covariances(P, n, at, scaled(-1.0, row.by_X), out)
+def pose_after(x: Floats, P: Floats, motion: Motion) -> tuple[Floats, Floats, Floats]:
+    """Pose of the body a motion after the state: R' (3, 3), X' (3,), and the covariance ``T P_vv T^T + C`` of delta."""
+    R, X, T = body_after(x, motion.dR, motion.dp)
+    cov = T @ P[:POSE, :POSE] @ T.T + motion.C
+    return R, X, 0.5 * (cov + cov.T)
 
 
-@inlined
-def _variance_share(U: Floats, at: int, row: MeasurementRow) -> float:
-    """``U H^T`` for a row of H with a landmark."""
-    return dot(row.by_X, minus(vector(U), vector(U[at:]))) + dot(row.by_angles, vector(U[3:]))
+def location(
+    x: Floats, motion: Motion, sonar: SonarModel, z: Floats, elevation_rad: float
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """The point ``g(x_v, z, elevation) = X' + R' q`` that a detection shows, and its derivatives.
+
+    Returns g (3,); ``G_v = G_b T`` by x_v (3, 6); ``G_b = R' [-[q]x  I]`` by delta (3, 6); G_z by (range, azimuth,
+    elevation) (3, 3).
+    """
+    R, X, T = body_after(x, motion.dR, motion.dp)
+    q = sonar.body_p_sonar + sonar.body_R_sonar @ sonar_point(z[0], z[1], elevation_rad)
+    minus_q_x = np.array([[0.0, q[2], -q[1]], [-q[2], 0.0, q[0]], [q[1], -q[0], 0.0]])
+    G_b = R @ np.hstack([minus_q_x, np.eye(3)])
+    return X + R @ q, G_b @ T, G_b, R @ sonar.body_R_sonar @ sonar_point_jacobian(z[0], z[1], elevation_rad)
+
+
+def augment(x: Floats, P: Floats, motion: Motion, sonar: SonarModel, z: Floats, R_z: Floats) -> tuple[Floats, Floats]:
+    """State and covariance with a new landmark where it was seen, on a floor of known height within the floor's gate.
+
+    ``P_pv = G_v P_v.``,  ``P_pp = G_v P_vv G_v^T + G_b C G_b^T + G_z diag(R_z, elevation_sigma^2) G_z^T``.
+    """
+    R, X, _ = body_after(x, motion.dR, motion.dp)
+    p, G_v, G_b, G_z = location(x, motion, sonar, z, sonar.elevation_of_new(R, X, z))
+    P_pv = G_v @ P[:POSE]
+    P_pp = P_pv[:, :POSE] @ G_v.T + G_b @ motion.C @ G_b.T + G_z @ polar_covariance(R_z, sonar.aperture_rad) @ G_z.T
+    x, P = np.concatenate([x, p]), np.block([[P, P_pv.T], [P_pv, 0.5 * (P_pp + P_pp.T)]])
+    if (sonar.floor_z_m - x[-1]) ** 2 <= FLOOR_GATE * (P[-1, -1] + sonar.floor_variance_m2):
+        correct_number(x, P, len(x) - 1, sonar.floor_z_m, sonar.floor_variance_m2)
+    return x, P
+
+
+def observe_far(
+    x: Floats, P: Floats, at: int, motion: Motion, sonar: SonarModel, z: Floats, R_z: Floats
+) -> tuple[bool, Floats, Floats] | None:
+    """Update as `observe` by a landmark far from where it is predicted, by the point seen (`far_view`); else None."""
+    seen, G_v, G_b, G_z = location(x, motion, sonar, z, 0.0)
+    H = np.zeros((LANDMARK, len(x)))
+    H[:, :POSE], H[:, at : at + LANDMARK] = -G_v, np.eye(3)
+    U, missed = H @ P, seen - x[at : at + LANDMARK]
+    view = far_view(missed, U @ H.T + G_b @ motion.C @ G_b.T, G_z, sonar, z, R_z)
+    if view is None:
+        return None
+    if view.is_inside_gate:
+        correct(x, P, U, view.cov, missed)
+    return view.is_inside_gate, view.innovation, view.innovation_cov

@@ -1,98 +1,22 @@
-"""EKF-SLAM as published, in its textbook form: the estimator, and the update of its state over a window.
+"""EKF-SLAM as published, in its textbook form: the estimator around `baselines.ekf_equations`.
 
-Equations (4) to (7) of the paper are in `baselines.ekf_equations`; docs/theory/ekf_slam.md.
+docs/theory/ekf_slam.md.
 """
 
 import math
 from typing import ClassVar
 
+import gtsam
 import numpy as np
 
-from baselines.ekf_equations import (
-    LANDMARK,
-    POSE,
-    correct_depth,
-    correct_state,
-    correct_up,
-    observe_rows,
-    pose_after,
-    predict,
-)
-from baselines.filter import FilterShell
-from baselines.filter_motion import (
-    inflate_shared_motion,
-    motion_since_node,
-    motion_to_node,
-    no_provisional_motion,
-    up_at_node,
-)
-from baselines.filter_window import (
-    BEFORE_ALL,
-    DEPTH,
-    FRAME,
-    NODE,
-    NODE_REACHED,
-    FilterParams,
-    GravityInterval,
-    MeasurementWindow,
-    PoseArrays,
-    VehicleModel,
-    WindowValues,
-    depth_sample,
-    frame_at,
-    next_event,
-    reach_node,
-    stamps_of,
-)
-from baselines.sonar_update import DetectionOutcomes, SonarModel, no_outcomes
-from sonar_graph.calibration import Calibration, Section
+from baselines import ekf_equations
+from baselines.ekf_equations import LANDMARK, POSE
+from baselines.filter import FilterParams, FilterShell, Motion
+from sonar_graph.calibration import Calibration, PlanarMotion, Section
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats
 from sonar_graph.motion import MotionSource
-from sonar_graph.numerics import compiled, euler_from_rates, euler_from_rotation, matrix, vector
 
-
-@compiled
-def process_window(x: Floats, P: Floats, n: int, values: WindowValues) -> tuple[int, DetectionOutcomes, PoseArrays]:
-    """Carry the state to the newest epoch reached at the window's end, with all measurements on the way.
-
-    Returns the length of the state, the outcomes of the detections, and the pose at the window's end. x and P (changed)
-    have room for all landmarks of the window; ``values`` are the fields of a `MeasurementWindow`.
-    """
-    window = MeasurementWindow(*values)
-    columns, clock, interval = window.columns, window.clock, GravityInterval(*window.interval)
-    vehicle, sonar = VehicleModel(*window.vehicle), SonarModel(*window.sonar)
-    stamps, outcomes = stamps_of(window), no_outcomes(len(window.frame_ns))
-    event, running = BEFORE_ALL, no_provisional_motion()
-    while True:
-        event = next_event(stamps, clock, vehicle.gap[0], event)
-        if event.kind == NODE_REACHED:
-            motion = motion_to_node(columns, vehicle, x, clock[NODE], event.stamp_ns)
-            predict(x, P, n, motion)
-            reach_node(clock, event.stamp_ns)
-            up, sigma = up_at_node(columns, vehicle, motion, clock, interval)
-            if not math.isnan(sigma):
-                correct_up(x, P, n, up, sigma)
-            if vehicle.is_planar:
-                plane = (vehicle.plane_z_m, 0.0, 0.0)
-                variances = (vehicle.plane_z_variance, vehicle.plane_tilt_variance, vehicle.plane_tilt_variance)
-                for k in range(3):
-                    correct_state(x, P, n, 2 + k, plane[k], variances[k])
-            continue
-        running, motion = motion_since_node(columns, vehicle, x, running, clock[NODE], event.stamp_ns)
-        if event.count_in_gap > 0:
-            motion = inflate_shared_motion(motion, event.count_in_gap)
-        if event.kind == DEPTH:
-            z_m, variance_m2 = depth_sample(window.depth, event, vehicle)
-            correct_depth(x, P, n, motion, vehicle.body_p_port, z_m, variance_m2)
-        elif event.kind == FRAME:
-            n = observe_rows(x, P, n, motion, sonar, frame_at(window.detections, event, outcomes, clock))
-        else:
-            return n, outcomes, pose_after(x, P, motion)
-
-
-ROOM = 8
-"""Landmarks that the first arrays have room for; doubled when needed."""
 SINGULAR_COSINE = 1e-3
 """Below this cosine of the pitch the Euler angles are taken as singular."""
 
@@ -121,51 +45,84 @@ class EkfSlam(FilterShell):
     calibration
         Noise, mountings, start, floor.
     odometry
-        Source of motion, its own.
+        Source of motion; the filter takes its rows in.
     params
         None: the defaults.
     """
 
     Params: ClassVar[type[Section]] = EkfSlamParams
+    name = "ekf-slam"
 
     def __init__(self, calibration: Calibration, odometry: MotionSource, params: EkfSlamParams | None = None) -> None:
         super().__init__(calibration, odometry, params or EkfSlamParams())
-        start, room = calibration.start, POSE + LANDMARK * ROOM
-        self._n, self._x, self._P = POSE, np.zeros(room), np.zeros((room, room))
-        self._x[:3] = start.position_m
-        self._x[3:POSE] = euler_from_rotation(matrix(start.pose().rotation().matrix()))
-        E = np.array(euler_from_rates(vector(self._x[3:])))
+        start = calibration.start
+        self._x, self._P = np.array([*start.position_m, *start.pose().rotation().rpy()]), np.zeros((POSE, POSE))
+        W = ekf_equations.body_after(self._x, np.eye(3), np.zeros(3))[2][:3, 3:]
+        E = np.linalg.inv(W)
         self._P[:3, :3] = np.diag(np.square(start.position_sigma_m))
-        self._P[3:POSE, 3:POSE] = E @ np.diag(np.square(start.rpy_sigma_rad)) @ E.T
+        self._P[3:, 3:] = E @ np.diag(np.square(start.rpy_sigma_rad)) @ E.T
 
     def state(self) -> tuple[int, Floats, Floats]:
         """Stamp (ns), x of equation (4) and P of (5) at the newest epoch; copies."""
-        n = self._n
-        return self.node_ns, self._x[:n].copy(), self._P[:n, :n].copy()
+        return self.node_ns, self._x.copy(), self._P.copy()
 
-    def update(self, window: MeasurementWindow) -> tuple[DetectionOutcomes, PoseArrays]:
-        """Carry the state to the newest epoch reached at the window's end.
+    def predict(self, motion: Motion, duration_s: float) -> None:  # noqa: ARG002
+        """Carry the state over the motion to the next epoch.
 
         Raises
         ------
         EstimatorError
             When the pitch comes so near 90 degrees that the Euler angles are singular.
         """
-        needed, room = POSE + LANDMARK * (1 + max(window.detections[0].tolist(), default=-1)), len(self._x)
-        if needed > room:
-            grown = max(2 * room, needed)
-            x, P = np.zeros(grown), np.zeros((grown, grown))
-            x[:room], P[:room, :room] = self._x, self._P
-            self._x, self._P = x, P
-        self._n, outcomes, pose = process_window(self._x, self._P, self._n, (*window,))
+        ekf_equations.predict(self._x, self._P, motion.dR, motion.dp, motion.C)
         if math.cos(self._x[4]) < SINGULAR_COSINE:
             raise EstimatorError(
-                f"ekf-slam: pitch is {math.degrees(self._x[4]):.2f} deg at {window.clock[NODE]} ns, where the Euler"
-                " angles of its state are singular; use isam2 for this log"
+                f"ekf-slam: pitch is {math.degrees(self._x[4]):.2f} deg at {self.node_ns} ns, where the Euler angles"
+                " of its state are singular; use isam2 for this log"
             )
-        return outcomes, pose
+
+    def correct_up(self, up: Floats, sigma: float) -> None:
+        """Update roll and pitch by the world's up in the body."""
+        ekf_equations.correct_up(self._x, self._P, up, sigma)
+
+    def correct_plane(self, plane: PlanarMotion) -> None:
+        """Update Z, roll and pitch."""
+        for k, value, sigma in (
+            (2, plane.z_m, plane.z_sigma_m),
+            (3, 0.0, plane.tilt_sigma_rad),
+            (4, 0.0, plane.tilt_sigma_rad),
+        ):
+            ekf_equations.correct_number(self._x, self._P, k, value, sigma**2)
+
+    def correct_depth(self, motion: Motion, z_m: float, variance_m2: float) -> None:
+        """Update by the height of the pressure port."""
+        ekf_equations.correct_depth(self._x, self._P, motion.dR, motion.dp, motion.C, self.port, z_m, variance_m2)
+
+    def observe(
+        self, motion: Motion, slot: int, z: Floats, R_z: Floats, *, may_be_far: bool
+    ) -> tuple[bool, Floats, Floats]:
+        """Update by range and azimuth of a known landmark, (6) and (7)."""
+        at, sonar = POSE + LANDMARK * slot, self.sonar
+        if may_be_far and (told := ekf_equations.observe_far(self._x, self._P, at, motion, sonar, z, R_z)) is not None:
+            return told
+        dR, dp, C, _, _ = motion
+        return ekf_equations.observe(
+            self._x, self._P, at, dR, dp, C, sonar.body_R_sonar, sonar.body_p_sonar, z, R_z, sonar.gate
+        )
+
+    def augment(self, motion: Motion, z: Floats, R_z: Floats) -> None:
+        """Append a landmark to (4) and (5)."""
+        self._x, self._P = ekf_equations.augment(self._x, self._P, motion, self.sonar, z, R_z)
+
+    def pose_after(self, motion: Motion) -> tuple[Floats, Floats, Floats]:
+        """world_R_body (3, 3), position (3,), and covariance of [theta, rho] (6, 6) a motion after the state."""
+        return ekf_equations.pose_after(self._x, self._P, motion)
 
     def landmark(self, slot: int) -> tuple[Floats, Floats]:
         """Position, and its block of (5)."""
         block = slice(POSE + LANDMARK * slot, POSE + LANDMARK * (slot + 1))
         return self._x[block], self._P[block, block]
+
+    def attitude(self) -> Floats:
+        """world_R_body of the state, shape (3, 3)."""
+        return np.ascontiguousarray(gtsam.Rot3.RzRyRx(self._x[3:6]).matrix())

@@ -8,7 +8,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from baselines.filter import FilterShell
 from baselines.filter_motion import (
     inflate_shared_motion_with_bias,
     motion_since_node_with_bias,
@@ -46,6 +45,7 @@ from baselines.invariant_equations import (
     pose_after,
     predict,
 )
+from baselines.old_shell import FilterShell
 from baselines.sonar_update import DetectionOutcomes, SonarModel, no_outcomes
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.errors import EstimatorError

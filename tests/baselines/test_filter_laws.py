@@ -77,15 +77,19 @@ def seen(stamps_ns, range_m=2.0, azimuth_rad=0.1, landmark=3, probability=1.0):
     return LandmarkDetections(np.asarray(stamps_ns), *rows, np.full((*shape, 2, 2), np.nan), ids, probabilities)
 
 
+def begun(kind, calibration, **params):
+    return kind(calibration, Odometry(calibration), kind.Params(**params))
+
+
 def run(kind, sequence, rate_hz=1.0, **params):
-    estimator = kind(sequence.calibration, Odometry(sequence.calibration), kind.Params(**params))
+    estimator = begun(kind, sequence.calibration, **params)
     for window in sequence.replay(sequence.instants(rate_hz)):
         estimator.process(window)
     return estimator
 
 
 def estimate_after(kind, calibration, seconds, *rows):
-    return kind(calibration, Odometry(calibration)).process(Measurements(later(seconds), *rows))
+    return begun(kind, calibration).process(Measurements(later(seconds), *rows))
 
 
 def state_of(slam):
@@ -126,7 +130,7 @@ def circle(gyro_error=0.0, velocity_error=0.0):
 
 @every_filter
 def test_a_circle_is_a_circle(kind):
-    estimator, (gyro, doppler) = kind(circle_calibration()), circle()
+    estimator, (gyro, doppler) = begun(kind, circle_calibration()), circle()
     for end_ns in later(*np.arange(0.5, CIRCLE_S, 0.5)):
         rows = gyro.between(T0_NS - 1, end_ns), doppler.between(T0_NS - 1, end_ns)
         estimate = estimator.process(Measurements(int(end_ns), *rows))
@@ -206,7 +210,7 @@ def test_dead_reckoning_s_covariance_is_that_of_many_runs_with_a_constant_bias()
 
 def test_dead_reckoning_ignores_detections_and_says_so():
     stamps_ns = later(*range(CIRCLE_S + 1))
-    blind, told = (DeadReckoning(circle_calibration(), Odometry(circle_calibration())) for _ in range(2))
+    blind, told = (begun(DeadReckoning, circle_calibration()) for _ in range(2))
     one = told.process(Measurements(int(stamps_ns[-1]), *circle(), None, seen(stamps_ns)))
     other = blind.process(Measurements(int(stamps_ns[-1]), *circle()))
     assert one.world_T_body.equals(other.world_T_body, 0.0)
@@ -226,7 +230,7 @@ def test_causal_estimates_keep_the_later_answer_and_time_never_runs_back():
 @slam_filters
 def test_each_detection_has_its_outcome_and_a_refused_one_changes_nothing(kind):
     """Before the first node, without a probable identity, older than what is done, and outside the gate."""
-    slam = kind(Calibration())
+    slam = begun(kind, Calibration())
     assert slam.process(Measurements(T0_NS - 5, None, None, None, seen([T0_NS - 10]))) is None
     end_ns = later(1.0)
     slam.process(Measurements(end_ns, imu(1), dvl(1), None, seen([later(0.5)])))
@@ -249,13 +253,13 @@ def test_each_detection_has_its_outcome_and_a_refused_one_changes_nothing(kind):
 def test_a_row_after_the_instant_is_an_error_that_names_it(rows):
     (block,) = rows.values()
     with pytest.raises(MeasurementError, match=f"{type(block).__name__} has a row at {T0_NS + 1} ns, after end_ns"):
-        EkfSlam(Calibration(), Odometry(Calibration())).process(Measurements(T0_NS, **rows))
+        begun(EkfSlam, Calibration()).process(Measurements(T0_NS, **rows))
 
 
 @slam_filters
 def test_many_landmarks_stay_where_they_were_seen(kind):
     """More than the first arrays have room for, seen in the order of their identities turned round."""
-    slam, end_ns = kind(Calibration(floor=FloorPrior(z_m=-1.0, sigma_m=0.01))), later(1.0)
+    slam, end_ns = begun(kind, Calibration(floor=FloorPrior(z_m=-1.0, sigma_m=0.01))), later(1.0)
     slam.process(Measurements(end_ns, imu(1), dvl(1)))
     for landmark in reversed(range(20)):
         slam.process(Measurements(end_ns, None, None, None, seen([end_ns], 4.0, 0.05 * landmark, landmark)))
@@ -278,7 +282,7 @@ def test_the_outcome_does_not_depend_on_how_the_log_is_cut(mission, kind):
     instants = instants[instants < mission.start_ns + 15 * NS_PER_S]
     blocks = mission.imu, mission.dvl, mission.depth, mission.detections
     every_stamp = np.unique(np.concatenate([block.stamps_ns for block in blocks]))
-    live, windows = (kind(mission.calibration, Odometry(mission.calibration)) for _ in range(2))
+    live, windows = (begun(kind, mission.calibration) for _ in range(2))
     for row in mission.replay(every_stamp[every_stamp <= instants[-1]]):
         live.process(row)
     for window in mission.replay(instants):
@@ -303,7 +307,7 @@ def test_ekf_slam_on_filterpy_ends_in_the_same_state(monkeypatch, predicts_by_no
     mission = simulate_mission(MissionOptions(duration_s=40.0, landmarks=12, dvl_dropouts_per_hour=360.0))
     never_a_gap = mission.calibration.dvl.model_copy(update={"gap_s": 1e3})  # filterpy's takes straight lines
     calibration = mission.calibration.model_copy(update={"dvl": never_a_gap})
-    slam = EkfSlam(calibration, Odometry(calibration))
+    slam = begun(EkfSlam, calibration)
     for window in mission.replay(mission.instants(2.0)):
         slam.process(window)
     theirs = filterpy_ekf.run(mission, int(mission.instants(2.0)[-1]), predicts_by_node=predicts_by_node)
@@ -496,7 +500,7 @@ def in_a_gap(depth=None, detections=None):
 def test_many_depths_in_a_gap_tell_less_of_the_start_than_one_exact_one(kind):
     """All share the motion's error, whose variance in a gap is at least that of the random walk, ``q^2 T^3 / 3``."""
     sequence = in_a_gap(depths(later(*np.linspace(9.0, 9.9, 10)), 0.0))
-    slam = kind(sequence.calibration, Odometry(sequence.calibration))
+    slam = begun(kind, sequence.calibration)
     for window in sequence.replay(later(8.0, 9.95)):
         slam.process(window)
     assert slam.state()[0] == later(2.0)
