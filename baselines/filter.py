@@ -507,21 +507,15 @@ class FilterShell(ABC):
 
     def _use_gravity(self, event: Event, motion: Motion) -> None:
         """Update by the direction of gravity over an interval that ends at the state's epoch."""
-        imu, duration_s = self.calibration.imu, (event.end_ns - event.start_ns) * 1e-9
-        (v_i, variance_i), (v_j, variance_j) = self._opened_velocity, self.odometry.velocity_at_imu(event.end_ns)
-        up = up_direction(motion.impulse / duration_s, motion.dR, v_i, v_j, duration_s)
-        sigma = tilt_sigma(
-            duration_s,
-            math.sqrt(0.5 * (variance_i + variance_j)),
-            imu.accel_noise_density,
-            imu.accel_bias_sigma,
-            imu.gyro_noise_density,
-            imu.gyro_bias_sigma,
-            self.calibration.gravity_m_s2,
-        )
+        duration_s, velocity_i, variance_i = (event.end_ns - event.start_ns) * 1e-9, *self._opened_velocity
+        velocity_j, variance_j = self.odometry.velocity_at_imu(event.end_ns)
+        up = up_direction(motion.impulse / duration_s, motion.dR, velocity_i, velocity_j, duration_s)
+        velocity_sigma = math.sqrt(0.5 * (variance_i + variance_j))
+        sigma = tilt_sigma(duration_s, velocity_sigma, self.calibration.imu, self.calibration.gravity_m_s2)
         if math.isfinite(up[0]):
             self.correct_up(up, sigma)
-        self._opened_ns, self._opened_velocity, self._opened_R = event.end_ns, (v_j, variance_j), self.attitude()
+        self._opened_ns, self._opened_velocity = event.end_ns, (velocity_j, variance_j)
+        self._opened_R = self.attitude()
 
     def _see(self, landmark_id: int, motion: Motion, z: Floats, R_z: Floats) -> Told:
         """Update by a detection of a landmark, or append the landmark at first sight."""
