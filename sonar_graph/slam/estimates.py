@@ -16,13 +16,10 @@ import numpy as np
 from gtsam.symbol_shorthand import L, X
 
 from sonar_graph.errors import EstimatorError
-from sonar_graph.measurements import Floats
 from sonar_graph.navigation import PreintegratedMotion
-from sonar_graph.numerics import compiled
 from sonar_graph.slam.smoother import JointCovariance, Smoother
 from sonar_graph.states import Estimate, Trajectory
 
-NO_DERIVATIVE = np.zeros((6, 3))
 TRIANGLE = np.tril_indices(6)
 
 
@@ -46,14 +43,14 @@ class AnchoredPose:
         ``X Exp(e_X) M Exp(D e_b) = X M Exp(Ad(M^-1) e_X + D e_b)``, so the covariance is ``J P J^T`` with
         ``J = [Ad(M^-1) D]`` and P that of keyframe and bias, plus that of the motion.
         """
-        key, motion, D_bias = X(self.keyframe), self.motion.i_T_j, NO_DERIVATIVE
-        bias_row = 0
+        key, motion = X(self.keyframe), self.motion.i_T_j
+        J = np.zeros((6, len(joint.matrix)))
         if self.bias_key is not None:
-            motion, D_bias = self.motion.corrected(values.atPoint3(self.bias_key)), self.motion.D_bias
-            bias_row = joint.rows[self.bias_key]
-        J_pose = motion.inverse().AdjointMap()
-        cov = carried_covariance(joint.matrix, joint.rows[key], bias_row, J_pose, D_bias, self.motion.covariance)
-        return Estimate(self.stamp_ns, values.atPose3(key).compose(motion), cov)
+            motion, row = self.motion.corrected(values.atPoint3(self.bias_key)), joint.rows[self.bias_key]
+            J[:, row : row + 3] = self.motion.D_bias
+        J[:, joint.rows[key] : joint.rows[key] + 6] = motion.inverse().AdjointMap()
+        cov = J @ joint.matrix @ J.T + self.motion.covariance
+        return Estimate(self.stamp_ns, values.atPose3(key).compose(motion), 0.5 * (cov + cov.T))
 
 
 class PoseHistory:
@@ -121,18 +118,6 @@ def _estimates(
         joint = JointCovariance.of(marginals, together[0].keys())
         estimates += [instant.carried_on(values, joint) for instant in together]
     return estimates
-
-
-@compiled
-def carried_covariance(
-    joint: Floats, pose_row: int, bias_row: int, J_pose: Floats, D_bias: Floats, motion_cov: Floats
-) -> Floats:
-    """Covariance of a pose carried on by a motion, from that of keyframe and gyro bias, shape (6, 6)."""
-    pose, bias = slice(pose_row, pose_row + 6), slice(bias_row, bias_row + 3)
-    P_pose, P_cross, P_bias = joint[pose, pose].copy(), joint[pose, bias].copy(), joint[bias, bias].copy()
-    cross = J_pose @ P_cross @ D_bias.T
-    cov = J_pose @ P_pose @ J_pose.T + cross + cross.T + D_bias @ P_bias @ D_bias.T + motion_cov
-    return 0.5 * (cov + cov.T)
 
 
 Over = Literal["window", "history"]

@@ -183,9 +183,9 @@ class Keyframes:
         node_ns = int(epochs_ns[-1]) if len(epochs_ns) else None
         if node_ns is not None:
             sonar, bias_sigma = self.calibration.sonar, self.calibration.imu.gyro_bias_sigma
-            turn, shift = largest_variances(motion.covariance, motion.D_bias, bias_sigma)
-            share = max(turn / sonar.azimuth_sigma_rad**2, shift / sonar.range_sigma_m**2)
-            if share > self.params.motion_noise_share:
+            variances = np.diag(motion.covariance) + bias_sigma**2 * (motion.D_bias**2).sum(axis=1)
+            share = max(variances[:3]) / sonar.azimuth_sigma_rad**2, max(variances[3:]) / sonar.range_sigma_m**2
+            if max(share) > self.params.motion_noise_share:
                 self._set(node_ns)
                 motion = self.motion_since_newest(stamp_ns)
         if not self.odometry.is_gap(node_ns or self.stamps_ns[-1], stamp_ns):
@@ -291,16 +291,6 @@ class Keyframes:
         self.smoother.add_bias(new, self.smoother.values.atPoint3(old))
         self.smoother.add([factors.bias_walk(old, new, walk * np.sqrt(elapsed_s))])
         return new
-
-
-@compiled
-def largest_variances(cov: Floats, D_bias: Floats, bias_sigma: float) -> tuple[float, float]:
-    """Largest variance of rotation (rad²) and of translation (m²) by noise and an unknown gyro bias."""
-    largest = np.zeros(2)
-    for r in range(6):
-        by_bias = D_bias[r, 0] ** 2 + D_bias[r, 1] ** 2 + D_bias[r, 2] ** 2
-        largest[r // 3] = max(largest[r // 3], cov[r, r] + by_bias * bias_sigma**2)
-    return largest[0], largest[1]
 
 
 def weights_at_end(variance_m2: Floats, wander_m2: Floats) -> tuple[Floats, float]:

@@ -3,8 +3,6 @@
 With previous_T_sonar = (R, t), its covariance Sigma (tangent, rotation first) and a point q of the frame before::
 
     q <- R^T (q - t),    P <- R^T P R + J Sigma J^T + drift^2 I,    J = [[q]x | -I]
-
-Loops over the few tracks of a frame are compiled: a seventh of the time of array operations.
 """
 
 from __future__ import annotations
@@ -17,7 +15,9 @@ import gtsam
 import numpy as np
 
 from sonar_graph.measurements import Floats, Ints
-from sonar_graph.numerics import compiled
+
+SKEW = np.array([[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]])
+"""Nine elements of [q]x as ``q @ SKEW``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,9 +76,10 @@ class TrackStates:
 
     def moved(self, step: SonarStep, drift_m: float) -> TrackStates:
         """Prediction: the tracks in the sonar frame after a step."""
-        previous_R_sonar = np.ascontiguousarray(step.previous_T_sonar.rotation().matrix())
-        translation, step_cov = step.previous_T_sonar.translation(), np.ascontiguousarray(step.covariance)
-        q, P = predicted_points(self.position_m, self.position_cov, previous_R_sonar, translation, step_cov, drift_m**2)
+        R, t = step.previous_T_sonar.rotation().matrix(), step.previous_T_sonar.translation()
+        q, J = (self.position_m - t) @ R, np.empty((len(self), 3, 6))
+        J[:, :, :3], J[:, :, 3:] = (q @ SKEW).reshape(-1, 3, 3), -np.eye(3)
+        P = R.T @ self.position_cov @ R + J @ step.covariance @ J.mT + drift_m**2 * np.eye(3)
         return replace(self, position_m=q, position_cov=P)
 
 
@@ -91,91 +92,44 @@ class Expected(NamedTuple):
     """Derivative by the position, shape (M, 2, 3)."""
     S: Floats
     """Innovation covariance, shape (M, 2, 2)."""
+    information: Floats
+    """Inverse of S, shape (M, 2, 2)."""
 
     @classmethod
     def of(cls, tracks: TrackStates, noise: Floats) -> Expected:
         """Expectation under measurement noise of shape (2, 2)."""
-        return cls(*expected_ranges_azimuths(tracks.position_m, tracks.position_cov, noise))
+        q, (x, y, _) = tracks.position_m, tracks.position_m.T
+        h2 = x**2 + y**2
+        z, H = np.empty((len(q), 2)), np.zeros((len(q), 2, 3))
+        z[:, 0], z[:, 1] = np.sqrt(h2 + q[:, 2] ** 2), np.arctan2(y, x)
+        H[:, 0] = q / z[:, :1]
+        H[:, 1, 0], H[:, 1, 1] = -y / np.maximum(h2, 1e-12), x / np.maximum(h2, 1e-12)
+        S = H @ tracks.position_cov @ H.mT + noise
+        return cls(z, H, S, np.linalg.inv(S))
+
+    def innovations(self, z: Floats) -> Floats:
+        """Measured minus expected, the azimuth wrapped: of one measurement a track, or of shape (n, 1, 2) of each."""
+        e = z - self.z
+        e[..., 1] -= 2 * math.pi * np.rint(e[..., 1] / (2 * math.pi))
+        return e
 
     def densities(self, z: Floats, gate: float) -> Floats:
         """N(z; h(q), S) of n measurements; 0 where the squared Mahalanobis distance exceeds the gate. Shape (n, M)."""
-        return innovation_densities(self.z, self.S, z, gate)
+        e = self.innovations(z[:, None])
+        distance2 = (e[:, :, None] @ self.information @ e[:, :, :, None])[:, :, 0, 0]
+        peak = np.sqrt(np.linalg.det(self.information)) / (2 * math.pi)
+        return np.where(distance2 <= gate, peak * np.exp(-0.5 * distance2), 0.0)
 
 
 def corrected(tracks: TrackStates, expected: Expected, z: Floats, took: Ints, noise: Floats) -> TrackStates:
     """Update by the measurement that each track took (-1: none), with the covariance in Joseph's form."""
-    q, P = corrected_points(tracks.position_m, tracks.position_cov, expected, z, took, noise)
-    return replace(tracks, position_m=q, position_cov=P)
-
-
-@compiled
-def predicted_points(
-    position_m: Floats, position_cov: Floats, R: Floats, t: Floats, step_cov: Floats, drift2: float
-) -> tuple[Floats, Floats]:
-    """Positions and covariances in the sonar frame after a step."""
-    q, P = np.empty_like(position_m), np.empty_like(position_cov)
-    J = np.zeros((3, 6))
-    J[:, 3:] = -np.eye(3)
-    for m in range(len(q)):
-        q[m] = (position_m[m] - t) @ R
-        x, y, z = q[m]
-        J[0, 1], J[0, 2], J[1, 2] = -z, y, -x
-        J[1, 0], J[2, 0], J[2, 1] = z, -y, x
-        P[m] = R.T @ position_cov[m] @ R + J @ step_cov @ J.T + drift2 * np.eye(3)
-    return q, P
-
-
-@compiled
-def expected_ranges_azimuths(position_m: Floats, position_cov: Floats, noise: Floats) -> tuple[Floats, Floats, Floats]:
-    """Expected measurements, their derivatives and innovation covariances: the columns of `Expected`."""
-    n = len(position_m)
-    z, H, S = np.empty((n, 2)), np.zeros((n, 2, 3)), np.empty((n, 2, 2))
-    for m in range(n):
-        q = position_m[m]
-        level2 = q[0] ** 2 + q[1] ** 2
-        z[m, 0], z[m, 1] = math.sqrt(level2 + q[2] ** 2), math.atan2(q[1], q[0])
-        H[m, 0] = q / z[m, 0]
-        H[m, 1, 0], H[m, 1, 1] = -q[1] / max(level2, 1e-12), q[0] / max(level2, 1e-12)
-        S[m] = H[m] @ position_cov[m] @ H[m].T + noise
-    return z, H, S
-
-
-@compiled
-def _innovation(z: Floats, expected: Floats) -> Floats:
-    """Innovation of one measurement, the azimuth wrapped, shape (2,)."""
-    difference = z - expected
-    difference[1] -= 2 * math.pi * round(difference[1] / (2 * math.pi))
-    return difference
-
-
-@compiled
-def innovation_densities(expected: Floats, S: Floats, z: Floats, gate: float) -> Floats:
-    """Gaussian density of each measurement for each track, 0 outside the gate, shape (n, M)."""
-    densities = np.zeros((len(z), len(expected)))
-    for m in range(len(expected)):
-        information = np.linalg.inv(S[m])
-        peak = math.sqrt(np.linalg.det(information)) / (2 * math.pi)
-        for n in range(len(z)):
-            innovation = _innovation(z[n], expected[m])
-            distance2 = innovation @ information @ innovation
-            if distance2 <= gate:
-                densities[n, m] = peak * math.exp(-0.5 * distance2)
-    return densities
-
-
-@compiled
-def corrected_points(
-    position_m: Floats, position_cov: Floats, expected: Expected, z: Floats, took: Ints, noise: Floats
-) -> tuple[Floats, Floats]:
-    """Positions and covariances after the measurements."""
-    q, P = position_m.copy(), position_cov.copy()
-    for m in range(len(q)):
-        if took[m] >= 0:
-            gain = P[m] @ expected.H[m].T @ np.linalg.inv(expected.S[m])
-            rest = np.eye(3) - gain @ expected.H[m]
-            q[m] += gain @ _innovation(z[took[m]], expected.z[m])
-            P[m] = rest @ P[m] @ rest.T + gain @ noise @ gain.T
-    return q, P
+    if not (took >= 0).any():
+        return tracks
+    P, H = tracks.position_cov, expected.H
+    K = P @ H.mT @ expected.information * (took >= 0)[:, None, None]
+    q = tracks.position_m + (K @ expected.innovations(z[took])[:, :, None])[:, :, 0]
+    rest = np.eye(3) - K @ H
+    return replace(tracks, position_m=q, position_cov=rest @ P @ rest.mT + K @ noise @ K.mT)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ candidate of the most probable assignment. The elevation enters once, when a tra
 frame and must not be averaged.
 """
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -91,15 +92,15 @@ class Tracker:
         before = replace(moved, existence=moved.existence * np.exp(-elapsed_s / params.lifetime_s))
         self._stamp_ns, self._skipped = stamp_ns, None
 
-        z = np.stack([candidates.range_m[rows], candidates.azimuth_rad[rows]], axis=1)
+        z = np.array([candidates.range_m[rows], candidates.azimuth_rad[rows]]).T
         expected, window = Expected.of(before, self._noise), candidates.window
         sigma = np.sqrt(np.diagonal(expected.S, axis1=1, axis2=2))
-        # standard deviations from the lower and upper limits of range and azimuth, positive inside, shape (M', 2, 2)
-        inside = np.stack([(expected.z - window[:, 0]) / sigma, (window[:, 1] - expected.z) / sigma], axis=1)
-        in_image = np.asarray(np.prod(ndtr(inside[:, 0]) - ndtr(-inside[:, 1]), axis=1))
+        # standard deviations from the lower and upper limits of range and azimuth, positive inside, shapes (M', 2)
+        above, below = (expected.z - window[:, 0]) / sigma, (window[:, 1] - expected.z) / sigma
+        in_image = (ndtr(above) - ndtr(-below)).prod(axis=1)
         detection = params.detection_probability * in_image
         densities = expected.densities(z, self._gate)
-        area = float(np.prod(window[:, 1] - window[:, 0]))
+        area = math.prod((window[:, 1] - window[:, 0]).tolist())
 
         unexplained = (params.new_per_frame + params.clutter_per_frame) / area
         weights = densities * (before.existence * detection)
@@ -112,7 +113,7 @@ class Tracker:
         existence = before.existence * likelihood / (1.0 - before.existence + before.existence * likelihood)
         after = corrected(before, expected, z, took, self._noise)
         after = replace(after, existence=existence, frames_seen=before.frames_seen + (took >= 0))
-        least_inside = inside.min(axis=(1, 2), initial=0.0)
+        least_inside = np.minimum(above, below).min(axis=1)
         reasons = ["left the image" if least < -params.leaving_sigmas else "" for least in least_inside]
         for row in np.flatnonzero(existence < params.least_existence):
             reasons[row] = f"exists with less than {params.least_existence:g}"
@@ -124,7 +125,7 @@ class Tracker:
         """Keep the tracks without a reason to end, start new ones, and associate them with the tracks before."""
         stay = np.flatnonzero([not reason for reason in reasons])
         ended = np.flatnonzero([bool(reason) for reason in reasons])
-        new = np.array([row for row in range(len(matrix)) if row not in took], dtype=np.int64)
+        new = np.array(sorted(set(range(len(matrix))).difference(took.tolist())), dtype=np.int64)
         rows, previous_ids = np.append(took[stay], new), after.ids
         itself = np.eye(len(previous_ids), len(previous_ids) + 1)[stay]
         own = np.vstack([itself, np.zeros((len(new), len(previous_ids) + 1))])

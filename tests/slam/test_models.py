@@ -232,9 +232,8 @@ def test_weighing_is_mahalanobis_of_the_wrapped_innovation(
         return np.array([[range_sigma**2, off], [off, azimuth_sigma**2]])
 
     prior, noise = cov(0.1, azimuth_sigma, by_prior), cov(0.02, 0.01, by_noise)
-    (innovation,), (S,), (distance,), (gain,) = weigh(
-        np.array([[3.0 + range_off, measured]]), np.array([[3.0, expected]]), prior[None], noise[None]
-    )
+    z, predicted = np.array([[3.0 + range_off, measured]]), np.array([[3.0, expected]])
+    (innovation,), (S,), (distance,), (gain,) = vars(weigh(z, predicted, prior[None], noise[None])).values()
     assert innovation[0] == pytest.approx(range_off)
     assert abs(innovation[1]) <= np.pi + 1e-12
     assert np.exp(1j * (innovation[1] - (measured - expected))) == pytest.approx(1.0)

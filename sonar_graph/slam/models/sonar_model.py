@@ -64,6 +64,36 @@ def project(q: Floats) -> tuple[Floats, Floats]:
 
 
 @compiled
+def project_all(points: Floats, world_T_sonar: Floats) -> tuple[Floats, Floats, Floats]:
+    """Range and azimuth of points of the world, shape (m, 3), from a sonar's pose, shape (4, 4).
+
+    Returns
+    -------
+    (range m, azimuth rad), shape (m, 2); their derivatives by the right perturbation of the sonar's pose,
+    ``D_q [[q]x | -I]``, shape (m, 2, 6), and by the point, ``D_q sonar_R_world``, shape (m, 2, 3).
+    """
+    T, m = world_T_sonar, len(points)
+    view, by_sonar, by_point = np.empty((m, 2)), np.zeros((m, 2, 6)), np.empty((m, 2, 3))
+    for k in range(m):
+        dx, dy, dz = points[k, 0] - T[0, 3], points[k, 1] - T[1, 3], points[k, 2] - T[2, 3]
+        x = T[0, 0] * dx + T[1, 0] * dy + T[2, 0] * dz
+        y = T[0, 1] * dx + T[1, 1] * dy + T[2, 1] * dz
+        z = T[0, 2] * dx + T[1, 2] * dy + T[2, 2] * dz
+        h2 = x * x + y * y
+        r = math.sqrt(h2 + z * z)
+        view[k, 0], view[k, 1] = r, math.atan2(y, x)
+        by_sonar[k, 0, 3], by_sonar[k, 0, 4], by_sonar[k, 0, 5] = -x / r, -y / r, -z / r  # q^T [q]x = 0
+        by_sonar[k, 1, 0], by_sonar[k, 1, 1], by_sonar[k, 1, 2] = x * z / h2, y * z / h2, -1.0
+        by_sonar[k, 1, 3], by_sonar[k, 1, 4] = y / h2, -x / h2
+        for i in range(2):
+            for j in range(3):
+                by_point[k, i, j] = -(
+                    by_sonar[k, i, 3] * T[j, 0] + by_sonar[k, i, 4] * T[j, 1] + by_sonar[k, i, 5] * T[j, 2]
+                )
+    return view, by_sonar, by_point
+
+
+@compiled
 def sonar_point(range_m: float, azimuth_rad: float, elevation_rad: float) -> Floats:
     """The point in the sonar frame with these spherical coordinates, shape (3,), m."""
     level = range_m * math.cos(elevation_rad)
@@ -85,8 +115,7 @@ def sonar_point_jacobian(range_m: float, azimuth_rad: float, elevation_rad: floa
 
 def range_azimuth(world_T_sonar: gtsam.Pose3, p_world: Floats) -> Floats:
     """Range (m) and azimuth (rad) at which a sonar sees a point, shape (2,)."""
-    z, _ = project(np.asarray(world_T_sonar.transformTo(p_world), dtype=np.float64))
-    return z
+    return project_all(p_world[None], world_T_sonar.matrix())[0][0]
 
 
 def range_azimuth_jacobians(
@@ -99,11 +128,8 @@ def range_azimuth_jacobians(
     (range m, azimuth rad), shape (2,); the derivative by the body pose's right perturbation [theta, rho], shape (2, 6);
     the derivative by the landmark, shape (2, 3).
     """
-    world_T_sonar = world_T_body.compose(body_T_sonar)
-    q = np.asarray(world_T_sonar.transformTo(p_world), dtype=np.float64)
-    z, D_q = project(q)
-    by_sonar_pose = D_q @ np.hstack([skew(q), -np.eye(3)])
-    return z, by_sonar_pose @ body_T_sonar.inverse().AdjointMap(), D_q @ world_T_sonar.rotation().matrix().T
+    (z,), (by_sonar,), (by_point,) = project_all(p_world[None], world_T_body.compose(body_T_sonar).matrix())
+    return z, by_sonar @ body_T_sonar.inverse().AdjointMap(), by_point
 
 
 def locate(world_T_sonar: gtsam.Pose3, range_m: float, azimuth_rad: float, elevation_rad: float) -> Floats:
