@@ -20,6 +20,8 @@ row, with the variance of what may have changed since. Of a chain that ends a ga
 rows are no epochs. Stamps decide, not how a log is cut. docs/theory/gaps.md.
 """
 
+from collections.abc import Iterable
+from operator import add
 from typing import NamedTuple
 
 import numpy as np
@@ -27,25 +29,7 @@ from numpy.typing import NDArray
 
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.navigation.dvl_screening.partial_beams import Rows
-from sonar_graph.navigation.samples import EARLIEST_NS, LATEST_NS, is_partial, rows_until
-from sonar_graph.numerics import (
-    IDENTITY,
-    ZERO,
-    ZEROS,
-    Matrix,
-    Vector,
-    compiled,
-    cross,
-    dot,
-    inlined,
-    matrix,
-    minus,
-    multiple_of,
-    sum_of,
-    times,
-    transposed,
-    vector,
-)
+from sonar_graph.navigation.samples import EARLIEST_NS, LATEST_NS, is_partial
 from sonar_graph.states import Refusal, RefusedRow
 
 Flags = NDArray[np.bool_]
@@ -67,7 +51,6 @@ class GateResult(NamedTuple):
     """True where no row is partial or an outlier."""
 
 
-@compiled
 def gate_velocities(
     stamps: Ints,
     velocity: Floats,
@@ -83,41 +66,37 @@ def gate_velocities(
     ``walk`` is the root spectral density of the velocity's random walk, m/s/√s; ``gate`` the squared distance beyond
     which a row is an outlier.
     """
-    n = len(stamps)
-    distance, partial, outlier, is_plain = np.zeros(n), is_partial(cov), np.zeros(n, np.bool_), True
-    before = rows_until(known_ns, stamps[0] - 1) - 1
-    last_ns, u, Q = LATEST_NS, ZERO, ZEROS
+    distance, outlier, partial, is_plain = np.zeros(len(stamps)), np.zeros(len(stamps), np.bool_), is_partial(cov), True
+    before = int(known_ns.searchsorted(stamps[0])) - 1
+    last_ns, u, Q_u = LATEST_NS, [0.0] * 3, [0.0] * 9
     if before >= 0:
-        last_ns, u, Q = known_ns[before], vector(known_velocity[before]), matrix(known_cov[before])
-    for k in range(n):
-        v, Q_v = vector(velocity[k]), matrix(cov[k])
-        if stamps[k] > last_ns:
-            distance[k] = squared_distance(u, Q, v, Q_v, (stamps[k] - last_ns) * 1e-9, walk)
-        outlier[k] = distance[k] > gate
-        if not (outlier[k] or partial[k]):
-            last_ns, u, Q = stamps[k], v, Q_v
+        last_ns, u, Q_u = int(known_ns[before]), known_velocity[before].tolist(), known_cov[before].ravel().tolist()
+    rows = zip(stamps.tolist(), velocity.tolist(), cov.reshape(-1, 9).tolist(), partial.tolist(), strict=True)
+    for k, (stamp_ns, v, Q_v, is_without_direction) in enumerate(rows):
+        squared = squared_distance(u, Q_u, v, Q_v, (stamp_ns - last_ns) * 1e-9, walk) if stamp_ns > last_ns else 0.0
+        distance[k] = squared
+        if is_without_direction or squared > gate:
+            outlier[k], is_plain = squared > gate, False
         else:
-            is_plain = False
+            last_ns, u, Q_u = stamp_ns, v, Q_v
     return GateResult(distance, partial, outlier, is_plain)
 
 
-@compiled
-def distance_between(u: Floats, Q_u: Floats, v: Floats, Q_v: Floats, t: float, walk: float) -> float:
-    """`squared_distance` of arrays."""
-    return squared_distance(vector(u), matrix(Q_u), vector(v), matrix(Q_v), t, walk)
+def squared_distance(
+    u: Iterable[float], Q_u: Iterable[float], v: Iterable[float], Q_v: Iterable[float], t: float, walk: float
+) -> float:
+    """``e^T S^-1 e``, ``e = v - u``, of two velocities t seconds apart; covariances as nine elements.
 
-
-@inlined
-def squared_distance(u: Vector, Q_u: Matrix, v: Vector, Q_v: Matrix, t: float, walk: float) -> float:
-    """``e^T S^-1 e``, ``e = v - u``, of two velocities t seconds apart.
-
-    Columns of S^-1 are cross products of rows of S, over its determinant.
+    S^-1 is the adjugate of S over its determinant. Numbers one by one: an array operation costs as much as all of them.
     """
-    e = minus(v, u)
-    may_change = walk**2 * t + min(TURNING_RAD_S * t, 2.0) ** 2 * dot(u, u)
-    x, y, z = sum_of(sum_of(Q_u, Q_v), multiple_of(may_change, IDENTITY))
-    solved = times(transposed((cross(y, z), cross(z, x), cross(x, y))), e)
-    return dot(e, solved) / dot(x, cross(y, z))
+    (u_x, u_y, u_z), (v_x, v_y, v_z) = u, v
+    x, y, z = v_x - u_x, v_y - u_y, v_z - u_z
+    may_change = walk**2 * t + min(TURNING_RAD_S * t, 2.0) ** 2 * (u_x * u_x + u_y * u_y + u_z * u_z)
+    xx, xy, xz, _, yy, yz, _, _, zz = map(add, Q_u, Q_v)
+    xx, yy, zz = xx + may_change, yy + may_change, zz + may_change
+    a, b, c = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+    d, e, f = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
+    return (a * x * x + d * y * y + f * z * z + 2.0 * (b * x * y + c * x * z + e * y * z)) / (xx * a + xy * b + xz * c)
 
 
 LONG_NS = 3_000_000_000
@@ -244,7 +223,7 @@ class VelocityConfirmation:
         """Squared distance; the slower of the two says how much turning can change."""
         fast, slow = sorted((one, other), key=lambda row: -float(row.velocity @ row.velocity))
         elapsed_s = abs(other.stamp_ns - one.stamp_ns) * 1e-9
-        return distance_between(slow.velocity, slow.cov, fast.velocity, fast.cov, elapsed_s, self._walk)
+        return squared_distance(slow.velocity, slow.cov.ravel(), fast.velocity, fast.cov.ravel(), elapsed_s, self._walk)
 
 
 def needed(velocity: Floats) -> int:
