@@ -105,7 +105,7 @@ class Expected(NamedTuple):
         H[:, 0] = q / z[:, :1]
         H[:, 1, 0], H[:, 1, 1] = -y / np.maximum(h2, 1e-12), x / np.maximum(h2, 1e-12)
         S = H @ tracks.position_cov @ H.mT + noise
-        return cls(z, H, S, np.linalg.inv(S))
+        return cls(z, H, S, np.asarray(np.linalg.inv(S), np.float64))
 
     def innovations(self, z: Floats) -> Floats:
         """Measured minus expected, the azimuth wrapped: of one measurement a track, or of shape (n, 1, 2) of each."""

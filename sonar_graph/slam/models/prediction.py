@@ -119,8 +119,8 @@ class PredictedView:
             H[k, :, rows[key] : rows[key] + 3] = by_point[k]
         for k, source in enumerate(sources, start=len(keys)):
             H[k, :, rows[source.pose_key] : rows[source.pose_key] + 6] += by_point[k] @ source.by_pose
-        H, H_M = H.reshape(2 * n, len(P)), (by_sonar @ self._by_body).reshape(2 * n, 6)
-        joint = H @ P @ H.T + H_M @ self._motion.covariance @ H_M.T
+        J, J_M = H.reshape(2 * n, len(P)), (by_sonar @ self._by_body).reshape(2 * n, 6)
+        joint = J @ P @ J.T + J_M @ self._motion.covariance @ J_M.T
         for k, source in enumerate(sources, start=len(keys)):
             joint[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += by_point[k] @ source.cov @ by_point[k].T
         return predicted, np.asarray(0.5 * (joint + joint.T))
