@@ -1,20 +1,23 @@
-"""Compiled code: its first compilation is announced, and it does not outlive its sources."""
+"""Compiled code: a user who waits is told, and its cache follows what it was compiled from."""
 
 import importlib
 import os
+import pty
+import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from numba.core import event
 
 from sonar_graph.numerics import jit
-from sonar_graph.numerics.jit import NOTICE, nothing_is_cached
 
 KERNELS = """
 from sonar_graph.numerics import compiled, jit
 
-jit._sources.clear()  # of a fresh clone: those of the package are compiled here
+jit._compiled_in.clear()
 
 @compiled
 def twice(x):
@@ -25,25 +28,47 @@ def thrice(x):
     return 3 * x
 """
 CALLS = "import loops; assert loops.twice(2) == 4; assert loops.thrice(2) == 6; assert loops.twice(1.5) == 3.0"
+ERASED = "\r\x1b[2K"
 
 
-def told(folder: Path, program: str = CALLS) -> str:
+def told(folder: Path, program: str = CALLS, stderr: int = subprocess.PIPE, **environment: str) -> str:
     path = os.pathsep.join([str(folder), str(Path(__file__).parents[1])])
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", program],
-        capture_output=True,
-        text=True,
-        check=True,
-        env={**os.environ, "PYTHONPATH": path},
-    )
-    return done.stderr
+    env = {**os.environ, "PYTHONPATH": path, **environment}
+    done = subprocess.run([sys.executable, "-W", "error", "-c", program], stderr=stderr, text=True, check=True, env=env)
+    return done.stderr or ""
 
 
-def test_the_first_compilation_is_told_once_and_later_ones_are_not(tmp_path):
+@pytest.fixture
+def loops(tmp_path: Path) -> Path:
     (tmp_path / "loops.py").write_text(KERNELS)
-    assert told(tmp_path) == f"{NOTICE}\n"
-    assert told(tmp_path) == ""
-    assert told(tmp_path, "import loops; assert loops.thrice(1.5) == 4.5") == ""  # compiled, but not the first time
+    return tmp_path
+
+
+def test_the_first_compilation_is_told_once_and_later_ones_are_not(loops):
+    assert told(loops) == f"{jit.NOTICE}\n"
+    assert told(loops) == ""
+    assert told(loops, "import loops; assert loops.thrice(1.5) == 4.5") == ""  # compiled, but not the first time
+
+
+def test_a_long_wait_is_told_with_what_is_compiled_and_how_far_it_is(loops):
+    program = f"from sonar_graph.numerics import jit; jit.TELL_EVERY_S = 0.0; {CALLS}"
+    lines = [f"compiling for the first use: {name}" for name in ("twice (1 of", "thrice (2 of", "twice (3 of")]
+    assert told(loops, program) == "\n".join(
+        [jit.NOTICE, *(f"{line} about {n})" for line, n in zip(lines, (2, 2, 3))), ""]
+    )
+
+
+def test_a_terminal_shows_what_is_compiled_in_place_and_nothing_stays(loops):
+    reader, terminal = pty.openpty()
+    told(loops, stderr=terminal)
+    shown = os.read(reader, 10_000).decode()
+    told(loops, stderr=terminal)
+    os.write(terminal, b"end")
+    assert os.read(reader, 10_000) == b"end"  # from the cache: nothing
+    head, *lines = shown.split(ERASED)
+    assert head == f"{jit.NOTICE}\r\n"
+    assert lines[0] == "compiling for the first use: twice (1 of about 2)"
+    assert lines[-1] == ""
 
 
 def test_other_functions_of_numba_are_none_of_ours(tmp_path):
@@ -51,13 +76,24 @@ def test_other_functions_of_numba_are_none_of_ours(tmp_path):
     assert told(tmp_path, program) == ""
 
 
-def test_code_of_any_function_counts_as_cached(tmp_path):
-    (tmp_path / "__pycache__").mkdir()
-    assert nothing_is_cached([tmp_path])
-    (tmp_path / "__pycache__" / "loops.twice-3.py311.nbi").touch()
-    assert not nothing_is_cached([tmp_path])
+def test_the_cache_goes_where_numba_is_told_and_needs_no_compiler(loops):
+    told(loops, NUMBA_CACHE_DIR=str(loops / "elsewhere"))
+    assert list((loops / "elsewhere").rglob("*.nbi"))
+    assert told(loops, NUMBA_CACHE_DIR=str(loops / "elsewhere")) == ""
+    assert told(loops, NUMBA_DISABLE_JIT="1") == ""
+    assert not list(loops.glob("__pycache__/*.nbi"))
 
 
+CALLER = """
+from callee import inner
+from limits import LIMIT
+
+{imported}
+
+{decorator}
+def outer(x):
+    return 10.0 * inner(x) + LIMIT
+"""
 CALLEE = """
 {imported}
 
@@ -65,51 +101,49 @@ CALLEE = """
 def inner(x):
     return x + {offset}
 """
-CALLER = """
-from callee import inner
-
-{imported}
-
-{decorator}
-def outer(x):
-    return 10.0 * inner(x)
-"""
 CHECKED = {"imported": "from sonar_graph.numerics.jit import compiled", "decorator": "@compiled"}
 UNCHECKED = {"imported": "import numba", "decorator": "@numba.njit(cache=True, error_model='numpy')"}
+Ask = Callable[..., tuple[float, int]]
 
 
 @pytest.fixture
-def answer(tmp_path, monkeypatch):
-    """A compiled function that calls another in another file, imported afresh as a new interpreter would."""
-    monkeypatch.syspath_prepend(tmp_path)
+def ask(monkeypatch) -> Ask:
+    """Answer of a function that calls one in another file, imported as by a new interpreter, and functions compiled."""
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    names = ("limits", "callee", "caller")
 
-    def ask(how: dict[str, str], offset: float) -> float:
-        for name, text in (("callee.py", CALLEE.format(**how, offset=offset)), ("caller.py", CALLER.format(**how))):
-            if not (tmp_path / name).exists() or (tmp_path / name).read_text() != text:
-                (tmp_path / name).write_text(text)
-        monkeypatch.setattr(jit, "_sources", set())
-        for name in ("callee", "caller"):
-            monkeypatch.delitem(sys.modules, name, raising=False)
+    def ask(folder: Path, how: dict[str, str] = CHECKED, offset: float = 1.0, limit: float = 0.0) -> tuple[float, int]:
+        texts = f"LIMIT = {limit}\n", CALLEE.format(**how, offset=offset), CALLER.format(**how)
+        for name, text in zip(names, texts, strict=True):
+            sys.modules.pop(name, None)
+            folder.mkdir(exist_ok=True)
+            if not (folder / f"{name}.py").exists() or (folder / f"{name}.py").read_text() != text:
+                (folder / f"{name}.py").write_text(text)
+        monkeypatch.syspath_prepend(folder)
         importlib.invalidate_caches()
-        return importlib.import_module("caller").outer(1.0)
+        with event.install_recorder("numba:compile") as recorder:
+            answer = importlib.import_module("caller").outer(1.0)
+        return answer, sum(found.is_start for _, found in recorder.buffer)
 
     yield ask
-    for name in ("callee", "caller"):
+    for name in names:
         sys.modules.pop(name, None)
 
 
-def test_cached_code_does_not_outlive_a_callee_in_another_file(answer, tmp_path):
-    """Nor is it dropped while nothing changes: the index then keeps its time."""
-    assert answer(CHECKED, 1.0) == 20.0
-    (index,) = (tmp_path / "__pycache__").glob("caller.outer-*.nbi")
-    made_ns = index.stat().st_mtime_ns
-    assert answer(CHECKED, 1.0) == 20.0
-    assert index.stat().st_mtime_ns == made_ns
-    assert answer(CHECKED, 2.5) == 35.0
-    assert index.stat().st_mtime_ns > made_ns
+def test_cached_code_is_used_until_what_it_was_compiled_from_changes(ask, tmp_path):
+    here, there = tmp_path / "here", tmp_path / "there"
+    assert ask(here) == (20.0, 2)
+    assert ask(here) == (20.0, 0)
+    for path in here.glob("*.py"):
+        os.utime(path, ns=(2_000_000_000 * 10**9,) * 2)
+    assert ask(here) == (20.0, 0)
+    shutil.copytree(here, there)  # times of sources are those of the copy, as of an installed package
+    shutil.rmtree(here)
+    assert ask(there) == (20.0, 0)
+    assert ask(there, offset=2.5) == (35.0, 2)
+    assert ask(there, offset=2.5, limit=4.0) == (39.0, 1)  # a number of a file without compiled functions
 
 
-def test_without_the_check_the_old_answer_comes_from_the_cache(answer):
+def test_without_the_check_the_old_answer_comes_from_the_cache(ask, tmp_path):
     """Negative control."""
-    assert answer(UNCHECKED, 1.0) == answer(UNCHECKED, 2.5) == 20.0
+    assert ask(tmp_path, UNCHECKED)[0] == ask(tmp_path, UNCHECKED, offset=2.5)[0] == 20.0

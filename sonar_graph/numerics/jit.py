@@ -1,28 +1,32 @@
-"""Compilation of loops over samples and pixels to machine code, with a cache that follows changed callees."""
+"""Compilation of loops over samples and pixels to machine code, with a cache that follows what the code calls."""
 
+import hashlib
 import logging
+import sys
 import threading
 import time
-from collections.abc import Iterable
+from collections import Counter
+from functools import cache
 from pathlib import Path
-from types import FunctionType
+from types import FunctionType, ModuleType
 from typing import Any, TypeVar, cast
 
 import numba
 from numba.core import event
+from numba.core.dispatcher import Dispatcher
 
 LOG = logging.getLogger(__name__)
-NOTICE = "compiling, once: the first use takes minutes, later ones find the code in __pycache__"
+NOTICE = "compiling for the first use, once: later uses find the code in their cache"
+TELL_EVERY_S = 10.0
 Compiled = TypeVar("Compiled")
-_sources: set[Path] = set()
+_compiled_in: Counter[str] = Counter()
+"""Number of compiled functions of each module."""
 
 
 def compiled(function: Compiled) -> Compiled:
     """Compile to machine code at the first call; the code is cached beside the source.
 
-    numba drops cached code when the function's own file changes, but not when a function that it calls in another file
-    does. Callees are decorated before their callers (their modules are imported first), so code older than the newest
-    file seen so far is removed here.
+    It is compiled again when the contents of its file change, or of a file whose compiled functions it can call.
     """
     return _compiled(function, forceinline=False)
 
@@ -39,38 +43,77 @@ def inlined(function: Compiled) -> Compiled:
 
 def _compiled(function: Compiled, *, forceinline: bool) -> Compiled:
     assert isinstance(function, FunctionType)
-    source = Path(function.__code__.co_filename)
-    _sources.add(source)
-    newest_ns = max(path.stat().st_mtime_ns for path in _sources)
-    for index in (source.parent / "__pycache__").glob(f"{source.stem}.{function.__qualname__}-*.nbi"):
-        if index.stat().st_mtime_ns < newest_ns:
-            index.unlink(missing_ok=True)
-    return cast(Compiled, numba.njit(cache=True, error_model="numpy", forceinline=forceinline)(function))
+    _compiled_in[function.__module__] += 1
+    made = numba.njit(cache=True, error_model="numpy", forceinline=forceinline)(function)
+    if isinstance(made, Dispatcher):  # a plain function with NUMBA_DISABLE_JIT
+        # numba's own stamp is of the function's file alone, and in its older versions of the file's time
+        cast(Any, made)._cache._cache_file._source_stamp = _digest(function.__globals__)
+    return cast(Compiled, made)
 
 
-def nothing_is_cached(folders: Iterable[Path]) -> bool:
-    """True where no folder of sources has compiled code of any function."""
-    return not any(any((folder / "__pycache__").glob("*.nbi")) for folder in folders)
+def _digest(module: dict[str, Any]) -> str:
+    """Digest of the files of a module and of all modules with compiled functions that it names, directly or not.
+
+    Numbers that these modules name are part of it, since the code holds their values.
+    """
+    parts: dict[str, str] = {}
+    waiting = [module]
+    while waiting:
+        names = waiting.pop()
+        if names["__name__"] in parts:
+            continue
+        numbers = sorted((name, repr(value)) for name, value in names.items() if isinstance(value, int | float))
+        status = Path(names["__file__"]).stat()
+        parts[names["__name__"]] = repr((_contents(names["__file__"], status.st_mtime_ns, status.st_size), numbers))
+        for value in names.values():
+            of = value if isinstance(value, ModuleType) else sys.modules.get(getattr(value, "__module__", None) or "")
+            if of is not None and of.__name__ in _compiled_in:
+                waiting.append(vars(of))
+    return hashlib.sha256("".join(parts[name] for name in sorted(parts)).encode()).hexdigest()
 
 
-class _Notice(event.Listener):
-    """Logs once, before the first compilation of a process, that it takes long, where nothing is cached yet."""
+@cache
+def _contents(path: str, _mtime_ns: int, _size: int) -> str:
+    """Digest of a file, read anew in a process when it has changed."""
+    return hashlib.sha256(Path(path).read_bytes()).hexdigest()
+
+
+class _Progress(event.Listener):
+    """Says what is compiled: first in the log, then on a line of the terminal, or every `TELL_EVERY_S` in the log."""
 
     def __init__(self) -> None:
-        self._is_first = True
+        self._depth, self._count, self._told_s = 0, 0, 0.0
 
     def on_start(self, event: Any) -> None:
-        source = Path(event.data["dispatcher"].py_func.__code__.co_filename)
-        if self._is_first and source in _sources:
-            self._is_first = False
-            if nothing_is_cached({source.parent for source in _sources}):
+        dispatcher, now_s, terminal = event.data["dispatcher"], time.monotonic(), _terminal()
+        if dispatcher.py_func.__module__ not in _compiled_in:
+            return
+        if not self._count:
+            self._told_s = now_s
+            if not any(Path(dispatcher._cache.cache_path).glob("*.nbi")):
                 LOG.warning(NOTICE)
+        self._depth, self._count = self._depth + 1, self._count + 1
+        about = max(self._count, _compiled_in.total())
+        line = f"compiling for the first use: {dispatcher.py_func.__name__} ({self._count} of about {about})"
+        if terminal:
+            print(f"\r\x1b[2K{line}", end="", file=terminal, flush=True)
+        elif now_s - self._told_s >= TELL_EVERY_S:
+            self._told_s = now_s
+            LOG.warning(line)
 
     def on_end(self, event: Any) -> None:
-        """Required by numba; nothing to log."""
+        if event.data["dispatcher"].py_func.__module__ in _compiled_in:
+            self._depth -= 1
+            if not self._depth and (terminal := _terminal()):
+                print("\r\x1b[2K", end="", file=terminal, flush=True)
 
 
-event.register("numba:compile", _Notice())  # type: ignore[no-untyped-call]  # numba has no types
+def _terminal() -> Any:
+    """Standard error where a user reads it, not as a progress bar redirects it."""
+    return sys.__stderr__ if sys.__stderr__ and sys.__stderr__.isatty() else None
+
+
+event.register("numba:compile", _Progress())  # type: ignore[no-untyped-call]  # numba has no types
 
 
 class _Stopwatch(event.Listener, threading.local):
