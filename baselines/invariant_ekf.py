@@ -3,96 +3,39 @@
 Equations: `baselines.invariant_equations`; docs/theory/invariant_ekf.md.
 """
 
-import math
 from typing import ClassVar
 
 import numpy as np
 
-from baselines.filter_motion import (
-    inflate_shared_motion_with_bias,
-    motion_since_node_with_bias,
-    motion_to_node_with_bias,
-    up_at_node,
-)
-from baselines.filter_window import (
-    BEFORE_ALL,
-    DEPTH,
-    FRAME,
-    NODE,
-    NODE_REACHED,
-    FilterParams,
-    GravityInterval,
-    MeasurementWindow,
-    PoseArrays,
-    VehicleModel,
-    WindowValues,
-    depth_sample,
-    frame_at,
-    next_event,
-    reach_node,
-    stamps_of,
-)
+from baselines.filter import FilterParams, FilterShell, Motion, far_view, is_inside, polar_covariance
 from baselines.invariant_equations import (
     BARE,
-    BIAS,
+    BETA,
     BODY,
+    POINT,
+    THETA,
+    UP,
     InvariantState,
-    correct_depth,
-    correct_plane,
-    correct_up,
+    augmented,
+    correct,
+    hat,
+    height_of_body_point,
+    height_of_point,
+    innovation_covariance,
     landmark_covariance,
-    observe_rows,
-    pose_after,
+    location,
+    observation,
+    place_of,
+    pose,
+    pose_covariance,
     predict,
+    symmetric,
+    up_innovation,
 )
-from baselines.old_shell import FilterShell
-from baselines.sonar_update import DetectionOutcomes, SonarModel, no_outcomes
-from sonar_graph.calibration import Calibration, Section
-from sonar_graph.errors import EstimatorError
+from sonar_graph.calibration import Calibration, PlanarMotion, Section
 from sonar_graph.measurements import Floats
 from sonar_graph.motion import MotionSource
-from sonar_graph.numerics import compiled, skew
-
-StateValues = tuple[Floats, Floats, Floats, Floats]
-"""Fields of an `InvariantState`."""
-
-
-@compiled
-def process_window(
-    state_values: StateValues, walk_density: float, values: WindowValues
-) -> tuple[StateValues, DetectionOutcomes, PoseArrays]:
-    """Carry the state to the newest epoch reached at the window's end, with all measurements on the way.
-
-    Returns the state, the outcomes of the detections, and the pose at the window's end. ``state_values`` (changed) and
-    ``values`` are the fields of an `InvariantState` and a `MeasurementWindow`; the bias walks by ``walk_density``,
-    rad/s²/√Hz.
-    """
-    window, state = MeasurementWindow(*values), InvariantState(*state_values)
-    columns, clock, interval = window.columns, window.clock, GravityInterval(*window.interval)
-    vehicle, sonar = VehicleModel(*window.vehicle), SonarModel(*window.sonar)
-    stamps, outcomes, event = stamps_of(window), no_outcomes(len(window.frame_ns)), BEFORE_ALL
-    while True:
-        event = next_event(stamps, clock, vehicle.gap[0], event)
-        if event.kind == NODE_REACHED:
-            motion = motion_to_node_with_bias(columns, vehicle, state.R, state.bias, clock[NODE], event.stamp_ns)
-            predict(state, motion, walk_density**2 * (event.stamp_ns - clock[NODE]) * 1e-9)
-            reach_node(clock, event.stamp_ns)
-            up, sigma = up_at_node(columns, vehicle, motion.integral, clock, interval)
-            if not math.isnan(sigma):
-                correct_up(state, up, sigma**2)
-            if vehicle.is_planar:
-                correct_plane(state, vehicle.plane_z_m, vehicle.plane_z_variance, vehicle.plane_tilt_variance)
-            continue
-        motion = motion_since_node_with_bias(columns, vehicle, state.R, state.bias, clock[NODE], event.stamp_ns)
-        if event.count_in_gap > 0:
-            motion = inflate_shared_motion_with_bias(motion, event.count_in_gap)
-        if event.kind == DEPTH:
-            z_m, variance_m2 = depth_sample(window.depth, event, vehicle)
-            correct_depth(state, motion, vehicle.body_p_port, z_m, variance_m2)
-        elif event.kind == FRAME:
-            state = observe_rows(state, motion, sonar, frame_at(window.detections, event, outcomes, clock))
-        else:
-            return (state.R, state.points, state.bias, state.P), outcomes, pose_after(state, motion)
+from sonar_graph.slam.models import FLOOR_GATE, wrap_angle
 
 
 class InvariantEkfParams(FilterParams):
@@ -118,12 +61,13 @@ class InvariantEkf(FilterShell):
     calibration
         Noise, mountings, start, floor. ``imu.gyro_bias_sigma = 0`` means that there is no bias, and none that walks.
     odometry
-        Source of motion, its own.
+        Source of motion; the filter takes its rows in.
     params
         None: the defaults.
     """
 
     Params: ClassVar[type[Section]] = InvariantEkfParams
+    name = "invariant-ekf"
 
     def __init__(
         self, calibration: Calibration, odometry: MotionSource, params: InvariantEkfParams | None = None
@@ -135,25 +79,80 @@ class InvariantEkf(FilterShell):
 
     def state(self) -> tuple[int, InvariantState]:
         """Stamp (ns) and a copy of the state at the newest epoch."""
-        return self.node_ns, InvariantState(*(part.copy() for part in self._state))
+        s = self._state
+        return self.node_ns, InvariantState(s.R.copy(), s.points.copy(), s.bias.copy(), s.P.copy())
 
-    def update(self, window: MeasurementWindow) -> tuple[DetectionOutcomes, PoseArrays]:
-        """Carry the state to the newest epoch reached at the window's end.
+    def attitude(self) -> Floats:
+        """world_R_body of the state, shape (3, 3)."""
+        return self._state.R
 
-        Raises
-        ------
-        EstimatorError
-            When a variance in the log or the calibration makes an innovation covariance not positive definite.
-        """
-        try:
-            state, outcomes, pose = process_window((*self._state,), self._walk_density, (*window,))
-        except np.linalg.LinAlgError as error:
-            raise EstimatorError(
-                f"invariant-ekf: between {window.clock[NODE]} and {window.until_ns} ns the expected covariance of a"
-                " measurement is not positive definite; give variances above zero in log and calibration"
-            ) from error
-        self._state = InvariantState(*state)
-        return outcomes, pose
+    def gyro_bias(self) -> Floats:
+        """Estimated gyro bias, shape (3,), rad/s."""
+        return self._state.bias
+
+    def predict(self, motion: Motion, duration_s: float) -> None:
+        """Carry the state over the motion to the next epoch, (2) and (3)."""
+        predict(self._state, motion, self._walk_density**2 * duration_s)
+
+    def correct_up(self, up: Floats, sigma: float) -> None:
+        """Update by the world's up in the body, shape (3,), with the sigma of its tilt, rad, (8)."""
+        y, H = up_innovation(self._state, up)
+        correct(self._state, *innovation_covariance(self._state, H, sigma**2 * np.eye(2)), y)
+
+    def correct_height(self, k: int, z_m: float, variance_m2: float, gate: float = np.inf) -> None:
+        """Update by the height of the body (k = 0) or a landmark within a gate, (7)."""
+        height_m, H = height_of_point(self._state, k)
+        HP, S = innovation_covariance(self._state, H, np.full((1, 1), variance_m2))
+        if (z_m - height_m) ** 2 <= gate * S[0, 0]:
+            correct(self._state, HP, S, np.array([z_m - height_m]))
+
+    def correct_plane(self, plane: PlanarMotion) -> None:
+        """Update by the plane on which the vehicle stays: height and tilt."""
+        self.correct_height(0, plane.z_m, plane.z_sigma_m**2)
+        self.correct_up(UP, plane.tilt_sigma_rad)
+
+    def correct_depth(self, motion: Motion, z_m: float, variance_m2: float) -> None:
+        """Update by the height of the pressure port a motion after the state, (7)."""
+        height_m, H, H_m = height_of_body_point(self._state, motion, self.port)
+        HP, S = innovation_covariance(self._state, H, H_m @ motion.C @ H_m.T + variance_m2)
+        correct(self._state, HP, S, np.array([z_m - height_m]))
+
+    def observe(
+        self, motion: Motion, slot: int, z: Floats, R_z: Floats, *, may_be_far: bool
+    ) -> tuple[bool, Floats, Floats]:
+        """Update by range and azimuth of a known landmark, (5), or the point seen where it may be far away, (6)."""
+        state, k = self._state, 1 + slot
+        if may_be_far:
+            x, G, G_m, G_z = location(state, motion, self.sonar, *z, 0.0)
+            # Exp(theta) turns both points: what is missed is xi_k - xi_new, without theta however far they are apart
+            missed, H = x - state.points[k], -G
+            H[:, place_of(k)] += np.eye(POINT)
+            HP, S = innovation_covariance(state, H, G_m @ motion.C @ G_m.T)
+            view = far_view(missed, S, G_z, self.sonar, z, R_z)
+            if view is not None:
+                if view.is_inside_gate:
+                    correct(state, HP, view.cov, missed)
+                return view.is_inside_gate, view.innovation, view.innovation_cov
+        predicted, H, H_m = observation(state, k, motion, self.sonar)
+        e = z - predicted
+        e[1] = wrap_angle(e[1])
+        HP, S = innovation_covariance(state, H, H_m @ motion.C @ H_m.T + R_z)
+        is_used = is_inside(e, S, self.sonar.gate)
+        if is_used:
+            correct(state, HP, S, e)
+        return is_used, e, S
+
+    def augment(self, motion: Motion, z: Floats, R_z: Floats) -> None:
+        """Append a landmark seen for the first time, (6), on a floor of known height within the floor's gate."""
+        elevation_rad = self.sonar.elevation_of_new(*pose(self._state, motion), z)
+        x, G, G_m, G_z = location(self._state, motion, self.sonar, *z, elevation_rad)
+        view = polar_covariance(R_z, self.sonar.aperture_rad)
+        self._state = augmented(self._state, x, G, G_m @ motion.C @ G_m.T + G_z @ view @ G_z.T)
+        self.correct_height(len(self._state.points) - 1, self.sonar.floor_z_m, self.sonar.floor_variance_m2, FLOOR_GATE)
+
+    def pose_after(self, motion: Motion) -> tuple[Floats, Floats, Floats]:
+        """world_R_body (3, 3), position (3,), and covariance of [theta, rho] (6, 6) a motion after the state."""
+        return *pose(self._state, motion), pose_covariance(self._state, motion)
 
     def landmark(self, slot: int) -> tuple[Floats, Floats]:
         """Position, and covariance of its coordinates."""
@@ -161,16 +160,14 @@ class InvariantEkf(FilterShell):
 
 
 def start_state(calibration: Calibration) -> InvariantState:
-    """State at the start, without landmarks, and the covariance of its xi.
+    """State at the start, without landmarks.
 
     Errors of the start, ``R = R^ Exp(delta)`` and ``X = X^ + d``, are ``theta = R^ delta``, ``xi_0 = d + [X^]x theta``.
     """
-    start, bias_sigma = calibration.start, calibration.imu.gyro_bias_sigma
-    R, X = np.ascontiguousarray(start.pose().rotation().matrix()), np.array(start.position_m)
-    P = np.zeros((BARE, BARE))
-    P[:BIAS, :BIAS] = R @ np.diag(np.square(start.rpy_sigma_rad)) @ R.T
-    P[BODY:, :BIAS] = skew(X) @ P[:BIAS, :BIAS]
-    P[:BIAS, BODY:] = P[BODY:, :BIAS].T
-    P[BODY:, BODY:] = P[BODY:, :BIAS] @ skew(X).T + np.diag(np.square(start.position_sigma_m))
-    P[BIAS:BODY, BIAS:BODY] = np.eye(3) * bias_sigma**2
-    return InvariantState(R, X[None].copy(), np.zeros(3), 0.5 * (P + P.T))
+    start = calibration.start
+    R, X = start.pose().rotation().matrix(), np.array(start.position_m)
+    A, P = np.zeros((BARE, 6)), np.zeros((BARE, BARE))
+    A[THETA, :3], A[BODY, :3], A[BODY, 3:] = R, hat(X) @ R, np.eye(3)
+    P = A @ np.diag(np.square((*start.rpy_sigma_rad, *start.position_sigma_m))) @ A.T
+    P[BETA, BETA] = np.eye(3) * calibration.imu.gyro_bias_sigma**2
+    return InvariantState(R, X[None].copy(), np.zeros(3), symmetric(P))

@@ -1,24 +1,45 @@
-"""Laws of landmarks in a frame of detections, for both filters: augmentation, floor, gate, innovation, order."""
+"""Laws of landmarks, for both filters: augmentation, floor, gate, innovation, and views from far away."""
 
 import math
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.stats import chi2
 
-from baselines.sonar_update import GATED, NEW, NO_SLOT, PASSED_OVER, USED
+from sonar_graph.calibration import FloorPrior, SonarCalibration
 from sonar_graph.slam.landmarks.association import gate_threshold
 from sonar_graph.slam.models.sonar_model import FLOOR_GATE, elevation_on_floor, locate, range_azimuth
+from sonar_graph.testing.numerical import central_differences
 
-from .filters import BODY_M, LEVEL, MOTION_SIGMA, NOISE, SONAR, TWIST, both, observed, sonar_pose
+from .filters import (
+    BODY_M,
+    CALIBRATION,
+    MOTION_SIGMA,
+    NOISE,
+    TWIST,
+    World,
+    begun,
+    both,
+    motion_of,
+    random_covariance,
+    rotation,
+    sonar_after,
+    world_at,
+)
 
-TILTED = np.array([0.1, 0.2, 0.3])
+LEVEL, TILTED, MOTION = np.zeros(3), np.array([0.1, 0.2, 0.3]), motion_of(TWIST)
 
 
-def drawn(filter_, state, rng):
-    """A true state, and the sonar there after a motion that errs."""
-    true = filter_.moved(state, np.linalg.cholesky(state.P) @ rng.normal(size=len(state.P)))
-    return true, sonar_pose(filter_, true, TWIST, MOTION_SIGMA * rng.normal(size=6))
+def bare(filter_, angles, scale):
+    """An estimate without landmarks, and its covariance."""
+    return world_at(angles, []), random_covariance(filter_.bare, scale)
+
+
+def drawn(filter_, world, P, rng):
+    """A true world, and the sonar there after a motion that errs."""
+    true = filter_.moved(world, np.linalg.cholesky(P) @ rng.normal(size=len(P)))
+    return true, sonar_after(true, MOTION, MOTION_SIGMA * rng.normal(size=6))
 
 
 def assert_covariance_of(draws, actual):
@@ -28,68 +49,72 @@ def assert_covariance_of(draws, actual):
 
 
 def with_landmark(filter_, angles=TILTED, view=(2.0, 0.3, 0.05), scale=0.002):
-    """A state with one landmark, and what is to be seen of it."""
-    pose = sonar_pose(filter_, filter_.state(angles, [], scale))
-    return filter_.state(angles, [locate(pose, *view)], scale), np.array(view[:2])
+    """An estimate with one landmark and its covariance, and what is to be seen of it."""
+    world = world_at(angles, locate(sonar_after(world_at(angles), MOTION), *view))
+    return world, random_covariance(filter_.bare + 3, scale), np.array(view[:2])
 
 
-def assert_same_state(one, other):
-    for part, same in zip(one, other, strict=True):
-        assert_array_equal(part, same)
+def floored(z_m, sigma_m=1e-2):
+    return CALIBRATION.model_copy(update={"floor": FloorPrior(z_m=z_m, sigma_m=sigma_m)})
+
+
+def augmented(filter_, angles, scale, z, calibration=CALIBRATION):
+    """Filter that sees its first landmark, and this landmark with its covariance."""
+    slam = begun(filter_, *bare(filter_, angles, scale), calibration)
+    slam.augment(MOTION, np.array(z), NOISE)
+    return slam, *slam.landmark(0)
 
 
 @pytest.mark.slow
 @both
 def test_a_new_landmark_has_the_covariance_of_many_draws(filter_):
     """Of state, bias, motion, range and azimuth, and an elevation anywhere in the aperture."""
-    rng, aperture, before = np.random.default_rng(5), 0.05, filter_.state(TILTED, [], 0.003)
-    after, seen = observed(filter_, before, [0], [[2.0, 0.3]], SONAR._replace(aperture_rad=aperture))
-    assert seen.outcomes.tolist() == [NEW]
+    rng, aperture, before = np.random.default_rng(5), 0.05, bare(filter_, TILTED, 0.003)
+    sonar = CALIBRATION.sonar.model_copy(update={"elevation_aperture_rad": aperture})
+    calibration = CALIBRATION.model_copy(update={"sonar": sonar})
+    _, position, covariance = augmented(filter_, TILTED, 0.003, [2.0, 0.3], calibration)
     draws = []
     for _ in range(20_000):
         z = rng.multivariate_normal([2.0, 0.3], NOISE)
-        draws.append(locate(drawn(filter_, before, rng)[1], *z, rng.uniform(-0.5, 0.5) * aperture))
-    assert_allclose(filter_.world(after)[2][0], np.mean(draws, axis=0), atol=2e-3)
-    assert_covariance_of(draws, filter_.covariance(after, 1))
+        draws.append(locate(drawn(filter_, *before, rng)[1], *z, rng.uniform(-0.5, 0.5) * aperture))
+    assert_allclose(position, np.mean(draws, axis=0), atol=2e-3)
+    assert_covariance_of(draws, covariance)
 
 
 @pytest.mark.slow
 @both
 def test_an_innovation_has_the_covariance_of_many_draws(filter_):
     rng = np.random.default_rng(7)
-    state, z = with_landmark(filter_)
-    after, seen = observed(filter_, state, [0], [z + np.array([0.01, -0.005])])
-    assert seen.outcomes.tolist() == [USED]
-    assert_allclose(seen.innovations[0], [0.01, -0.005], atol=1e-9)
+    world, P, z = with_landmark(filter_)
+    is_used, e, S = begun(filter_, world, P).observe(MOTION, 0, z + np.array([0.01, -0.005]), NOISE, may_be_far=False)
+    assert is_used
+    assert_allclose(e, [0.01, -0.005], atol=1e-9)
     views = []
     for _ in range(20_000):
-        true, pose = drawn(filter_, state, rng)
-        view = np.asarray(range_azimuth(pose, filter_.world(true)[2][0]))
+        true, pose = drawn(filter_, world, P, rng)
+        view = np.asarray(range_azimuth(pose, true.landmarks[0]))
         views.append(view + np.sqrt(np.diag(NOISE)) * rng.normal(size=2))
-    assert_covariance_of(views, seen.covs[0])
-    assert np.trace(filter_.covariance(after, 0)) < np.trace(filter_.covariance(state, 0))
+    assert_covariance_of(views, S)
 
 
 @both
 def test_a_known_floor_fixes_the_height_of_a_new_landmark(filter_):
-    state = filter_.state(LEVEL, [], 0.003)
-    true = locate(sonar_pose(filter_, state), 2.0, 0.3, 0.05)
-    sonar = SONAR._replace(has_floor=True, floor_z_m=true[2], floor_variance_m2=1e-6)
-    after, _ = observed(filter_, state, [0], [[2.0, 0.3]], sonar)
-    assert_allclose(filter_.world(after)[2][0], true, atol=1e-3)
-    assert filter_.covariance(after, 1)[2, 2] == pytest.approx(1e-6, rel=0.01)
+    true = locate(sonar_after(world_at(LEVEL), MOTION), 2.0, 0.3, 0.05)
+    _, position, covariance = augmented(filter_, LEVEL, 0.003, [2.0, 0.3], floored(true[2], 1e-3))
+    assert_allclose(position, true, atol=1e-3)
+    assert covariance[2, 2] == pytest.approx(1e-6, rel=0.01)
 
 
 @both
 def test_without_a_floor_in_reach_a_new_landmark_is_on_the_centre_beam_and_the_vehicle_stays(filter_):
-    state = filter_.state(TILTED, [], 0.003)
-    middle = locate(sonar_pose(filter_, state), 3.0, 0.3, 0.0)
-    for sonar in (SONAR, SONAR._replace(has_floor=True, floor_z_m=BODY_M[2] - 5.0)):
-        after, seen = observed(filter_, state, [0], [[3.0, 0.3]], sonar)
-        assert seen.outcomes.tolist() == [NEW]
-        assert_allclose(filter_.world(after)[2][0], middle, atol=1e-12)
-        assert_array_equal(filter_.world(after)[1], filter_.world(state)[1])
-        assert_array_equal(filter_.covariance(after, 0), filter_.covariance(state, 0))
+    world, P = bare(filter_, TILTED, 0.003)
+    middle = locate(sonar_after(world, MOTION), 3.0, 0.3, 0.0)
+    for calibration in (CALIBRATION, floored(BODY_M[2] - 5.0)):
+        slam, position, _ = augmented(filter_, TILTED, 0.003, [3.0, 0.3], calibration)
+        assert_allclose(position, middle, atol=1e-12)
+        after, covariance = filter_.estimate(slam)
+        assert_array_equal(after.X, world.X)
+        assert_array_equal(covariance[: len(P), : len(P)], P)
 
 
 @both
@@ -97,20 +122,20 @@ def test_without_a_floor_in_reach_a_new_landmark_is_on_the_centre_beam_and_the_v
 @pytest.mark.parametrize("side", [-1, 1])
 def test_a_floor_outside_the_aperture_counts_up_to_its_gate(filter_, side, share, is_used):
     """The innovation's variance has the aperture's share, the pose's and the floor's."""
-    state, floor_variance = filter_.state(TILTED, [], 0.002), 1e-4
-    bare, _ = observed(filter_, state, [0], [[2.0, 0.3]])
-    height_m, variance = filter_.world(bare)[2][0, 2], filter_.covariance(bare, 1)[2, 2]
+    _, position, covariance = augmented(filter_, TILTED, 0.002, [2.0, 0.3])
+    variance, floor_variance = covariance[2, 2], 1e-4
     off_m = side * math.sqrt(share * FLOOR_GATE * (variance + floor_variance))
-    sonar = SONAR._replace(has_floor=True, floor_z_m=height_m + off_m, floor_variance_m2=floor_variance)
-    pose = sonar_pose(filter_, state)
-    assert elevation_on_floor(pose, 2.0, 0.3, sonar.floor_z_m, sonar.aperture_rad) is None
-    after, _ = observed(filter_, state, [0], [[2.0, 0.3]], sonar)
+    floor_z_m = position[2] + off_m
+    pose = sonar_after(world_at(TILTED), MOTION)
+    assert elevation_on_floor(pose, 2.0, 0.3, floor_z_m, CALIBRATION.sonar.elevation_aperture_rad) is None
+    _, after, cov = augmented(filter_, TILTED, 0.002, [2.0, 0.3], floored(floor_z_m, 1e-2))
     if is_used:
         gain = variance / (variance + floor_variance)
-        assert filter_.covariance(after, 1)[2, 2] == pytest.approx(gain * floor_variance, rel=0.05)
-        assert filter_.world(after)[2][0, 2] == pytest.approx(height_m + gain * off_m, abs=0.01)
+        assert cov[2, 2] == pytest.approx(gain * floor_variance, rel=0.05)
+        assert after[2] == pytest.approx(position[2] + gain * off_m, abs=0.01)
     else:
-        assert_same_state(after, bare)
+        assert_array_equal(after, position)
+        assert_array_equal(cov, covariance)
 
 
 def test_the_floor_s_gate_is_passed_by_999_of_1000_that_stand_on_it():
@@ -118,37 +143,78 @@ def test_the_floor_s_gate_is_passed_by_999_of_1000_that_stand_on_it():
 
 
 @both
-def test_a_gated_or_passed_over_row_changes_nothing_and_has_its_innovation_or_none(filter_):
-    state, z = with_landmark(filter_)
-    after, seen = observed(filter_, state, [0, NO_SLOT], [z + np.array([1.0, 0.0]), z])
-    assert seen.outcomes.tolist() == [GATED, PASSED_OVER]
-    assert seen.innovations[0, 0] == pytest.approx(1.0)
-    assert np.linalg.eigvalsh(seen.covs[0]).min() > 0
-    assert np.isnan(seen.innovations[1]).all()
-    assert_same_state(after, state)
+def test_a_gated_detection_changes_nothing_and_has_its_innovation(filter_):
+    world, P, z = with_landmark(filter_)
+    slam = begun(filter_, world, P)
+    is_used, e, S = slam.observe(MOTION, 0, z + np.array([1.0, 0.0]), NOISE, may_be_far=False)
+    assert not is_used
+    assert e[0] == pytest.approx(1.0)
+    assert np.linalg.eigvalsh(S).min() > 0
+    after, covariance = filter_.estimate(slam)
+    assert_array_equal(after.landmarks, world.landmarks)
+    assert_array_equal(covariance, P)
 
 
 @both
 def test_the_innovation_of_azimuth_wraps_around(filter_):
-    state, _ = with_landmark(filter_, view=(3.0, math.pi - 0.004, 0.1))
-    _, seen = observed(filter_, state, [0], [[3.0, -math.pi + 0.004]])
-    assert seen.outcomes.tolist() == [USED]
-    assert seen.innovations[0, 1] == pytest.approx(0.008, abs=1e-9)
+    world, P, _ = with_landmark(filter_, view=(3.0, math.pi - 0.004, 0.1))
+    slam = begun(filter_, world, P)
+    is_used, e, _ = slam.observe(MOTION, 0, np.array([3.0, -math.pi + 0.004]), NOISE, may_be_far=False)
+    assert is_used
+    assert e[1] == pytest.approx(0.008, abs=1e-9)
+
+
+# ---------------------------------------------------------------------------------------------- views from far away
+
+FAR_LANDMARK, APERTURE_RAD, STILL = np.array([25.0, 12.0, -1.0]), 0.3, motion_of(np.zeros(6), np.zeros((6, 6)))
+AHEAD = CALIBRATION.model_copy(update={"sonar": SonarCalibration(elevation_aperture_rad=APERTURE_RAD)})
+"""A sonar at the origin of the body."""
+
+
+def look(filter_, X, position_sigma_m, may_be_far, wrong_m=0.0):
+    """One exact look at the landmark from X, by a filter that expects to be at the origin.
+
+    Returns whether it was used, position and covariance after it, the innovation and its covariance.
+    """
+    here = World(np.eye(3), np.zeros(3), FAR_LANDMARK[None])
+
+    def error(shift):
+        return filter_.error(World(rotation(shift[3:6]), shift[:3], here.landmarks + shift[6:]), here)
+
+    T = central_differences(error, np.zeros(9))
+    P = T @ np.diag(np.repeat(np.square([position_sigma_m, 1e-3, 0.01]), 3)) @ T.T
+    slam, q = begun(filter_, here, P, AHEAD), FAR_LANDMARK - X
+    z = np.array([np.linalg.norm(q) + wrong_m, np.arctan2(q[1], q[0])])
+    is_used, e, S = slam.observe(STILL, 0, z, slam.sonar.R_z, may_be_far=may_be_far)
+    _, at, covariance = slam.pose_after(STILL)
+    return is_used, at, covariance[3:, 3:], e, S
+
+
+@pytest.mark.slow
+@both
+def test_one_look_finds_a_vehicle_that_is_far_from_where_it_was_expected(filter_):
+    """And linearised where it was expected it is sure of a wrong place."""
+    X = np.array([40.0, 20.0, -0.5])
+    is_used, at, P, _, S = look(filter_, X, 30.0, may_be_far=True)
+    assert is_used
+    assert np.linalg.norm((at - X)[:2]) < 0.5
+    assert (at - X) @ np.linalg.solve(P, at - X) < chi2.ppf(0.99, 3)
+    assert S[0, 0] == pytest.approx(30.0**2, rel=0.01)
+    _, at, P, _, _ = look(filter_, X, 30.0, may_be_far=False)
+    assert (at - X) @ np.linalg.solve(P, at - X) > 1000.0
 
 
 @both
-def test_the_rows_of_a_frame_are_taken_in_their_order(filter_):
-    z = [[2.0, 0.3], [2.001, 0.301], [2.0, 0.3], [2.5, -0.3]]
-    after, seen = observed(filter_, filter_.state(LEVEL, [], 0.02), [0, 0, NO_SLOT, 1], z)
-    assert seen.outcomes.tolist() == [NEW, USED, PASSED_OVER, NEW]
-    assert len(filter_.world(after)[2]) == 2
+def test_a_vehicle_near_where_it_was_expected_sees_as_without_a_gap(filter_):
+    X = np.array([0.1, -0.1, 0.05])
+    with_gap, without = look(filter_, X, 0.2, True), look(filter_, X, 0.2, False)
+    for one, other in zip(with_gap, without, strict=True):
+        assert_array_equal(one, other)
 
 
 @both
-@pytest.mark.parametrize("hole", [(0, 0), (1, 1), (0, 1)])
-def test_noise_that_the_log_does_not_give_is_the_calibration_s(filter_, hole):
-    logged = NOISE.copy()
-    logged[hole] = math.nan
-    state, sonar = filter_.state(LEVEL, [], 0.02), SONAR._replace(range_variance_m2=NOISE[0, 0])
-    given, missing = (observed(filter_, state, [0], [[2.0, 0.3]], sonar, noise)[0] for noise in (NOISE, logged))
-    assert_same_state(given, missing)
+def test_what_no_vehicle_in_reach_sees_is_refused(filter_):
+    is_used, at, _, e, S = look(filter_, np.array([40.0, 20.0, -0.5]), 30.0, True, wrong_m=300.0)
+    assert not is_used
+    assert_allclose(at, 0.0, atol=1e-15)
+    assert e @ np.linalg.solve(S, e) > gate_threshold(0.999, 2)
