@@ -40,10 +40,10 @@ unobservable directions stay unobservable. Derivation: docs/theory/invariant_ekf
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
+from baselines.filter import Motion, SonarModel
 from sonar_graph.measurements import Floats
 from sonar_graph.numerics import compiled
 from sonar_graph.numerics.matrices import exp_and_mean, store, vec
@@ -70,22 +70,6 @@ class InvariantState:
     """Of the gyros, body axes, shape (3,), rad/s."""
     P: Floats
     """Covariance of xi, shape (9 + 3 N, 9 + 3 N)."""
-
-
-class BodyMotion(Protocol):
-    """Motion for the state's bias, with D and C; shapes (3, 3), (3,), (6, 3) and (6, 6)."""
-
-    dR: Floats
-    dp: Floats
-    D: Floats
-    C: Floats
-
-
-class Sonar(Protocol):
-    """Mounting of a sonar, shapes (3, 3) and (3,)."""
-
-    body_R_sonar: Floats
-    body_p_sonar: Floats
 
 
 def place_of(k: int) -> slice:
@@ -116,12 +100,12 @@ def retract(state: InvariantState, xi: Floats) -> None:
     state.bias = state.bias + xi[BETA]
 
 
-def pose(state: InvariantState, motion: BodyMotion) -> tuple[Floats, Floats]:
+def pose(state: InvariantState, motion: Motion) -> tuple[Floats, Floats]:
     """R' and X', a motion after the state, (2)."""
     return state.R @ motion.dR, state.points[0] + state.R @ motion.dp
 
 
-def predict(state: InvariantState, motion: BodyMotion, walk_variance: float) -> None:
+def predict(state: InvariantState, motion: Motion, walk_variance: float) -> None:
     """Carry estimate and covariance over a motion, (2) and (3).
 
     ``walk_variance`` is the variance of the bias walk since, each component, rad²/s².
@@ -137,7 +121,7 @@ def predict(state: InvariantState, motion: BodyMotion, walk_variance: float) -> 
     P[BETA, BETA] += walk_variance * np.eye(3)
 
 
-def pose_covariance(state: InvariantState, motion: BodyMotion) -> Floats:
+def pose_covariance(state: InvariantState, motion: Motion) -> Floats:
     """Covariance of the pose a motion after the state, in its own perturbation [theta, rho], shape (6, 6).
 
     The error of the state is there ``[R'^T theta; R'^T (xi_0 - [X']x theta)]``, to which ``D beta + eps`` is added.
@@ -162,7 +146,7 @@ def moved(q: Floats) -> Floats:
     return np.concatenate((-hat(q), np.eye(3)), axis=1)
 
 
-def observation(state: InvariantState, k: int, motion: BodyMotion, sonar: Sonar) -> tuple[Floats, Floats, Floats]:
+def observation(state: InvariantState, k: int, motion: Motion, sonar: SonarModel) -> tuple[Floats, Floats, Floats]:
     """Range and azimuth of landmark k, shape (2,), H (2, 9 + 3 N) and H_m (2, 6) of (5)."""
     R, X = pose(state, motion)
     q = R.T @ (state.points[k] - X)
@@ -175,7 +159,7 @@ def observation(state: InvariantState, k: int, motion: BodyMotion, sonar: Sonar)
 
 
 def location(
-    state: InvariantState, motion: BodyMotion, sonar: Sonar, range_m: float, azimuth_rad: float, elevation_rad: float
+    state: InvariantState, motion: Motion, sonar: SonarModel, range_m: float, azimuth_rad: float, elevation_rad: float
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """The point that is seen there, and the derivatives of its xi by (6).
 
@@ -191,7 +175,7 @@ def location(
     return X + R @ q, G, G_m, R @ sonar.body_R_sonar @ sonar_point_jacobian(*z)
 
 
-def height_of_body_point(state: InvariantState, motion: BodyMotion, q: Floats) -> tuple[float, Floats, Floats]:
+def height_of_body_point(state: InvariantState, motion: Motion, q: Floats) -> tuple[float, Floats, Floats]:
     """Height of point q of the body, H (1, 9 + 3 N) and H_m (1, 6) of (7)."""
     R, X = pose(state, motion)
     a = X + R @ q
@@ -228,10 +212,10 @@ def correct(state: InvariantState, HP: Floats, S: Floats, e: Floats) -> None:
 
 @compiled
 def correction(P: Floats, U: Floats, S: Floats, e: Floats) -> Floats:
-    """``K e`` with ``K = U^T S^-1``, shape (n,), and ``P <- P - K S K^T`` in place; ``U = H P`` (m, n), S (m, m), e (m,).
+    """``K e`` (n,) of an update by m numbers, ``K = U^T S^-1`` with ``U = H P`` (m, n); P becomes ``P - K S K^T``.
 
     With ``S = L L^T`` and ``V = L^-1 U`` that is ``P - V^T V``, row by row. Both factors of every product commute, so
-    that P stays symmetric to the last bit.
+    that P stays symmetric to the last bit. Raises LinAlgError where S is not positive definite.
     """
     n, L, V, y, moved = U.shape[1], S.copy(), U.copy(), e.copy(), np.zeros(U.shape[1])
     for r in range(len(e)):
@@ -240,6 +224,8 @@ def correction(P: Floats, U: Floats, S: Floats, e: Floats) -> Floats:
             y[r] -= L[r, c] * y[c]
             for i in range(n):
                 V[r, i] -= L[r, c] * V[c, i]
+        if not L[r, r] > 0.0:
+            raise np.linalg.LinAlgError("the covariance of an innovation is not positive definite")
         L[r, r] = math.sqrt(L[r, r])
         for k in range(r + 1, len(e)):
             for c in range(r):

@@ -234,6 +234,27 @@ def test_every_jacobian_is_the_numerical_one(angles, twist, view, turn):
     check(H, np.zeros((2, 6)), lambda true, _: invariant_equations.up_innovation(state, true.R.T @ UP)[0])
 
 
+def test_the_bias_walks_where_there_is_one():
+    slam, motion, duration_s = begun(Invariant, world_at(ANGLES)), motion_of(np.zeros(6), np.zeros((6, 6))), 4.0
+    before = slam.state()[1].P
+    density = CALIBRATION.imu.gyro_bias_walk_density
+    slam.predict(motion._replace(D=np.zeros((6, 3))), duration_s)
+    walked = np.diag([0.0] * 3 + [density**2 * duration_s] * 3 + [0.0] * 9)
+    assert_allclose(slam.state()[1].P - before, walked, atol=1e-3 * walked.max())
+
+
+@pytest.mark.parametrize("m", [1, 2, 5])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_correction_by_many_numbers_is_joseph_s_and_exactly_symmetric(seed, m):
+    rng, P, n = np.random.default_rng(seed), random_covariance(15, seed=seed), 15
+    H, root, e = rng.normal(size=(m, n)), 0.1 * rng.normal(size=(m, m)), 0.01 * rng.normal(size=m)
+    R = root @ root.T + 1e-3 * np.eye(m)
+    U, S = H @ P, H @ P @ H.T + R
+    after, K = P.copy(), U.T @ np.linalg.inv(S)
+    assert_allclose(invariant_equations.correction(after, U, S, e), K @ e, atol=1e-12)
+    assert_covariance(after, (np.eye(n) - K @ H) @ P @ (np.eye(n) - K @ H).T + K @ R @ K.T)
+
+
 def gauge(axes):
     """Moves of the whole world along x and y (and z), and its turn about the vertical, as columns of xi."""
     N = np.zeros((15, axes + 1))

@@ -94,15 +94,15 @@ def estimate_after(kind, calibration, seconds, *rows):
 
 def state_of(slam):
     """Arrays of the state at the newest node."""
-    return slam.state()[1:] if isinstance(slam, EkfSlam) else slam.state()[1]
+    return slam.state()[1:] if isinstance(slam, EkfSlam) else tuple(vars(slam.state()[1]).values())
 
 
 def height_and_tilt(slam):
     """Mean height of the body at the node, its variance, and the variances of roll and pitch (level only)."""
     if isinstance(slam, EkfSlam):
-        x, P = state_of(slam)
+        _, x, P = slam.state()
         return x[2], P[2, 2], np.diag(P)[3:5]
-    state = state_of(slam)
+    _, state = slam.state()
     return state.points[0, 2], state.P[8, 8], np.diag(state.P)[:2]
 
 

@@ -5,9 +5,15 @@ import math
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from baselines.filter import SonarModel, far_view, is_inside
 from sonar_graph.calibration import FloorPrior, SonarCalibration
+from sonar_graph.measurements import NS_PER_S
+from sonar_graph.navigation import Odometry
+from sonar_graph.sequence import Sequence
+from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 from sonar_graph.slam.landmarks.association import gate_threshold
 from sonar_graph.slam.models.sonar_model import FLOOR_GATE, elevation_on_floor, locate, range_azimuth
 from sonar_graph.testing.numerical import central_differences
@@ -218,3 +224,95 @@ def test_what_no_vehicle_in_reach_sees_is_refused(filter_):
     assert not is_used
     assert_allclose(at, 0.0, atol=1e-15)
     assert e @ np.linalg.solve(S, e) > gate_threshold(0.999, 2)
+
+
+def far(cov, G_z, range_m, noise, missed=(0.0, 0.0, 0.0), aperture_rad=APERTURE_RAD):
+    """`far_view` of a detection with this covariance of range and azimuth; None where it is linear enough."""
+    sonar = SonarModel.of(AHEAD, 0.999)._replace(aperture_rad=aperture_rad)
+    return far_view(np.array(missed), np.array(cov), G_z, sonar, np.array([range_m, 0.0]), np.array(noise))
+
+
+def test_the_noise_of_a_view_holds_that_of_many_beams_and_without_aperture_is_the_detection_s():
+    """Of elevations anywhere in the aperture, for a length that is taken at elevation zero."""
+    elevation = np.random.default_rng(3).uniform(-APERTURE_RAD / 2, APERTURE_RAD / 2, 200_000)
+    wide = 1e3 * np.eye(3)
+    V = far(wide, np.eye(3), 40.0, np.zeros((2, 2))).cov - wide
+    assert V[0, 0] == pytest.approx(np.mean(np.square(40.0 * (1 - np.cos(elevation)))), rel=0.02)
+    assert V[2, 2] == pytest.approx(np.var(elevation), rel=0.02)
+    noise = np.array([[0.04, -0.003], [-0.003, 0.0009]])
+    V = far(1e6 * np.eye(3), np.eye(3), 40.0, noise, aperture_rad=0.0).cov - 1e6 * np.eye(3)
+    assert_allclose(V, np.pad(noise, (0, 1)), atol=1e-9)
+
+
+def test_linear_is_what_errs_by_less_than_the_noise():
+    """Sagitta of an exact circle: across a beam of 10 m, sigma 1 m, a range is 5 cm longer."""
+    G_z, longer_m = np.diag([1.0, 10.0, 10.0]), np.hypot(10.0, 1.0) - 10.0
+    for share, is_linear in ((1.05, True), (0.95, False)):
+        assert (far(np.diag([0.0, 1.0, 0.0]), G_z, 10.0, np.diag([(share * longer_m) ** 2, 1.0])) is None) == is_linear
+    for sigma, is_linear in ((0.0101, True), (0.0099, False)):
+        assert (far(np.diag([1.0, 1.0, 0.0]), G_z, 10.0, np.diag([1.0, sigma**2])) is None) == is_linear
+    assert far(1e6 * np.diag([0.0, 0.0, 1.0]), G_z, 10.0, np.diag([1e-4, 1e-4])) is None
+
+
+TURNED = Rotation.from_euler("xyz", [0.4, -0.7, 1.9]).as_matrix()
+
+
+@pytest.mark.parametrize("range_m", [10.0, 3.0])
+def test_a_shift_and_what_is_linear_are_the_same_wherever_the_sonar_points(range_m):
+    """Of range and azimuth, blind to elevation; with 0.3 m along and 0.2 m across, 2 % on each side of linear."""
+    G_z, cov = TURNED @ np.diag([1.0, range_m, range_m]), TURNED @ np.diag([0.09, 0.04, 4.0]) @ TURNED.T
+    shift = far(1e6 * np.eye(3), G_z, range_m, np.eye(2), G_z @ [0.3, 0.02, 5.0]).innovation
+    assert_allclose(shift, [0.3, 0.02], atol=1e-12)
+    longer_m, turned_rad = 0.04 / (2 * range_m), 0.3 * 0.2 / range_m**2
+    for share, is_linear in ((0.98, False), (1.02, True)):
+        assert (far(cov, G_z, range_m, np.diag([(share * longer_m) ** 2, 9.0])) is None) == is_linear
+        assert (far(cov, G_z, range_m, np.diag([9.0, (share * turned_rad) ** 2])) is None) == is_linear
+
+
+@pytest.mark.parametrize("direction", [(2.0, 1.0), (2.0, -1.0), (1.0, 0.0)])
+def test_the_gate_is_an_ellipse_of_a_correlated_innovation(direction):
+    """Range and azimuth correlated by 0.9: along the long axis far more passes than across it."""
+    S, gate = np.array([[4.0, 1.8], [1.8, 1.0]]), gate_threshold(0.999, 2)
+    e = np.array(direction) * np.sqrt(gate / (direction @ np.linalg.solve(S, direction)))
+    assert is_inside(0.999 * e, S, gate)
+    assert not is_inside(1.001 * e, S, gate)
+
+
+BEFORE_S, LOST_S, AFTER_S = 25.0, 120.0, np.array([3.0, 10.0, 20.0])
+
+
+def nees_after_gap(filter_, seed, forgets_gap):
+    """NEES of position at `AFTER_S`; where the gap is forgotten, views are linearised at the predicted place."""
+    options = MissionOptions(
+        seed=seed, duration_s=BEFORE_S + LOST_S + 22.0, frame_rate_hz=0.5, false_detections_per_frame=0
+    )
+    mission = simulate_mission(options)
+    start_ns = mission.start_ns
+    seconds = (mission.dvl.stamps_ns - start_ns) / NS_PER_S
+    lost = mission.dvl.rows((seconds <= BEFORE_S) | (seconds >= BEFORE_S + LOST_S))
+    first_after = np.searchsorted(lost.stamps_ns, start_ns + (BEFORE_S + LOST_S) * NS_PER_S)
+    closed_ns = lost.stamps_ns[first_after + 1]  # the second row confirms the first
+    after_ns = closed_ns + np.round(AFTER_S * NS_PER_S).astype(np.int64)
+    sequence = Sequence("gap", mission.calibration, mission.imu, lost, None, mission.detections)
+    estimator, squares = filter_.kind(mission.calibration, Odometry(mission.calibration)), []
+    for window in sequence.replay(np.r_[closed_ns + NS_PER_S // 50, after_ns]):
+        estimate = estimator.process(window)
+        if forgets_gap:
+            estimator._was_lost = False
+        if window.end_ns in after_ns:
+            world_T_body = estimate.world_T_body
+            error = world_T_body.translation() - mission.truth.at(np.array([window.end_ns])).positions[0]
+            error = world_T_body.rotation().unrotate(error)
+            squares.append(error @ np.linalg.solve(estimate.covariance[3:, 3:], error))
+    return np.array(squares)
+
+
+@pytest.mark.slow
+@both
+def test_after_a_long_gap_landmarks_make_the_position_as_sure_as_it_is_right(filter_):
+    """Over short missions, two-sided 99.9 % of a chi-square; instants of a run share their errors and count as one."""
+    squares = np.array([nees_after_gap(filter_, seed, False) for seed in range(5)])
+    low, high = chi2.ppf([0.0005, 0.9995], 3 * len(squares))
+    for total in squares.sum(axis=0):
+        assert low < total < high
+    assert nees_after_gap(filter_, 0, True).min() > high
