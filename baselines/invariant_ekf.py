@@ -123,7 +123,7 @@ class InvariantEkf(FilterShell):
         """Update by range and azimuth of a known landmark, (5), or the point seen where it may be far away, (6)."""
         state, k = self._state, 1 + slot
         if may_be_far:
-            x, G, G_m, G_z = location(state, motion, self.sonar, *z, 0.0)
+            x, G, G_m, G_z = location(state, motion, self.sonar, z, 0.0)
             # Exp(theta) turns both points: what is missed is xi_k - xi_new, without theta however far they are apart
             missed, H = x - state.points[k], -G
             H[:, place_of(k)] += np.eye(POINT)
@@ -145,7 +145,7 @@ class InvariantEkf(FilterShell):
     def augment(self, motion: Motion, z: Floats, R_z: Floats) -> None:
         """Append a landmark seen for the first time, (6), on a floor of known height within the floor's gate."""
         elevation_rad = self.sonar.elevation_of_new(*pose(self._state, motion), z)
-        x, G, G_m, G_z = location(self._state, motion, self.sonar, *z, elevation_rad)
+        x, G, G_m, G_z = location(self._state, motion, self.sonar, z, elevation_rad)
         view = polar_covariance(R_z, self.sonar.aperture_rad)
         self._state = augmented(self._state, x, G, G_m @ motion.C @ G_m.T + G_z @ view @ G_z.T)
         self.correct_height(len(self._state.points) - 1, self.sonar.floor_z_m, self.sonar.floor_variance_m2, FLOOR_GATE)

@@ -159,20 +159,19 @@ def observation(state: InvariantState, k: int, motion: Motion, sonar: SonarModel
 
 
 def location(
-    state: InvariantState, motion: Motion, sonar: SonarModel, range_m: float, azimuth_rad: float, elevation_rad: float
+    state: InvariantState, motion: Motion, sonar: SonarModel, z: Floats, elevation_rad: float
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """The point that is seen there, and the derivatives of its xi by (6).
+    """The point that is seen at range and azimuth z, and the derivatives of its xi by (6).
 
     Returns the point (3,); G by xi, shape (3, 9 + 3 N); G_m by the motion, shape (3, 6); G_z by range, azimuth and
     elevation, shape (3, 3).
     """
     R, X = pose(state, motion)
-    z = range_m, azimuth_rad, elevation_rad
-    q = sonar.body_p_sonar + sonar.body_R_sonar @ sonar_point(*z)
+    q = sonar.body_p_sonar + sonar.body_R_sonar @ sonar_point(z[0], z[1], elevation_rad)
     G, G_m = np.zeros((3, len(state.P))), R @ moved(q)
     G[:, BODY] = np.eye(3)
     G[:, BETA] = G_m @ motion.D
-    return X + R @ q, G, G_m, R @ sonar.body_R_sonar @ sonar_point_jacobian(*z)
+    return X + R @ q, G, G_m, R @ sonar.body_R_sonar @ sonar_point_jacobian(z[0], z[1], elevation_rad)
 
 
 def height_of_body_point(state: InvariantState, motion: Motion, q: Floats) -> tuple[float, Floats, Floats]:

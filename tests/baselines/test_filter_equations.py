@@ -221,7 +221,7 @@ def test_every_jacobian_is_the_numerical_one(angles, twist, view, turn):
     z, H, H_m = invariant_equations.observation(state, 2, motion, sonar)
     assert_allclose(z[0], view[0], atol=1e-9)
     check(H, H_m, sight, [1])
-    x, G, G_m, G_z = invariant_equations.location(state, motion, sonar, *view)
+    x, G, G_m, G_z = invariant_equations.location(state, motion, sonar, view[:2], view[2])
     assert_allclose(x, world.landmarks[1], atol=1e-12)
     check(G, G_m, located)
     check_derivative(lambda off: located(world, NOTHING, off), G_z, np.zeros(3))
