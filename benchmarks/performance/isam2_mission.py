@@ -136,7 +136,8 @@ class PlainIsam2:
             self._values.insert(key, locate(world_T_sonar, z[0], z[1], elevation or 0.0))
             if floor:
                 self._graph.push_back(factors.floor_prior(key, floor.z_m, floor.sigma_m))
-        for factor in factors.landmark_sighting(X(self._index), key, body_T_sonar, z, cov, lambda noise: noise):
+        made = factors.landmark_sighting(X(self._index), key, body_T_sonar, z, cov, lambda noise: noise)
+        for factor in made.values():
             self._graph.push_back(factor)
 
 

@@ -75,8 +75,7 @@ class Sightings:
         self._body_T_sonar = sonar.mounting.pose()
         self._default_cov = np.diag([sonar.range_sigma_m**2, sonar.azimuth_sigma_rad**2])
         self._factors = SightingFactors(sonar, self.kernel.robust)
-        landmarks = self._landmarks = LandmarkSightings(self.smoother, self._factors)
-        self.smoother.when_withheld = lambda withheld: self._landmarks.withhold(withheld, self.journal)
+        landmarks = self._landmarks = LandmarkSightings(self.smoother, self._factors, self.journal)
         self._doubtful: DoubtfulIdentities | None = None
         self._anonymous: AnonymousLandmarks | None = None
         self._minimum_probability, self._gate, self._is_deferred = 0.0, np.inf, True
@@ -94,10 +93,11 @@ class Sightings:
         """Identities of the landmarks in the graph."""
         return self._landmarks.ids
 
-    def leave(self, pose_keys: set[int]) -> None:
-        """Forget sightings from poses that leave a bounded window."""
-        self._landmarks.leave(pose_keys)
-        self._deferred.leave(pose_keys)
+    def update_if_due(self) -> None:
+        """Bring the smoother up to date, and the sightings in line with what it withheld and gave up."""
+        if (changed := self.keyframes.update_if_due()) is not None:
+            self._landmarks.follow(changed)
+            self._deferred.leave(changed.left)
 
     def add(self, frame: LandmarkDetections) -> None:
         """Take in the detections of one frame."""
@@ -123,7 +123,7 @@ class Sightings:
         is_unnamed = unnamed(frame) & (self._anonymous is not None)
         is_tracked = (frame.track != NO_TRACK) & self._is_deferred & ~is_unnamed
         if is_tracked.any():
-            self.keyframes.update_if_due()
+            self.update_if_due()
             tracked = frame.rows(is_tracked)
             self._deferred.hear(tracked, decide(tracked, self._minimum_probability), self.keyframes.newest_s)
         verdicts = self._judge(stamp_ns, frame, identities, is_tracked.tolist())
@@ -156,7 +156,7 @@ class Sightings:
 
     def _doubt(self, doubtful: DoubtfulIdentities, stamp_ns: int, frame: LandmarkDetections) -> None:
         """Take in a frame whose identities are weighed against the places of its detections."""
-        self.keyframes.update_if_due()
+        self.update_if_due()
         rows = range(len(frame))
         statements, tracks = [IdentityPosterior.of(frame, row) for row in rows], frame.track.tolist()
         seen = self._seen(frame, identify(frame, 0.0), [True] * len(frame), list(rows))
@@ -168,7 +168,7 @@ class Sightings:
         for row, sighting in enumerate(sightings):
             of = statements[row].favourite if chosen[row] is None else chosen[row]
             sighting.row = self.journal.record(stamp_ns, -1 if of is None else of, sighting.outcome)
-        self.keyframes.update_if_due()
+        self.update_if_due()
         doubtful.reconsider(self.keyframes.newest_s)
 
     def forget(self) -> None:
@@ -187,7 +187,7 @@ class Sightings:
         if not rows:
             return verdicts
         seen = self._seen(frame, identities, is_tracked, rows)
-        self.keyframes.update_if_due()
+        self.update_if_due()
         motion = self.keyframes.motion_since_newest(stamp_ns)
         named = seen.where([refusals[row] is None for row in rows])
         is_known = [i in self._landmarks for i in named.ids]
@@ -201,7 +201,7 @@ class Sightings:
                 if refusals[row] is Outcome.REPEATED:  # a more probable row of the frame has the landmark
                     sighting.outcome = Outcome.REPEATED
                 verdicts[row] = SightingVerdict(sighting.outcome, sighting=sighting)
-        self.keyframes.update_if_due()
+        self.update_if_due()
         return verdicts
 
     def _seen(self, frame: LandmarkDetections, identities: Identities, is_tracked: list[bool], rows: list[int]) -> Seen:
@@ -237,12 +237,11 @@ class Sightings:
         points = np.array([self.smoother.values.atPoint3(key) for key in seen.keys])
         found = view.compare(seen.keys, points, seen.z, seen.cov)
         inside: list[bool] = (found.distance <= self._gate).tolist()
-        self.smoother.waiting_gain += float(found.gain[inside].sum())
         verdicts = {}
         for k, sighting in enumerate(self._sightings(view, tie, seen, points)):
             sighting.outcome = Outcome.USED if inside[k] else Outcome.GATED
             if inside[k]:
-                self._landmarks.add(sighting, seen.ids[k], is_first=False)
+                self._landmarks.add(sighting, seen.ids[k], is_first=False, gain=float(found.gain[k]))
             verdicts[seen.rows[k]] = SightingVerdict(
                 sighting.outcome, found.innovation[k], found.S[k], sighting=sighting
             )
@@ -267,7 +266,7 @@ class Sightings:
 
     def _merge(self, anonymous: AnonymousLandmarks) -> None:
         """Make one landmark of two that are one."""
-        self.keyframes.update_if_due()
+        self.update_if_due()
         if anonymous.has_landmarks and len(self.ids) > 1:
             joint = self.smoother.joint_covariance([self.keyframes.newest_key, *anonymous.keys()])
             anonymous.merge(joint, self.keyframes.newest_s)
@@ -276,7 +275,7 @@ class Sightings:
         self, anonymous: AnonymousLandmarks, stamp_ns: int, seen: Seen, named: dict[int, SightingVerdict]
     ) -> dict[int, SightingVerdict]:
         """Pair what has no identity with landmarks by geometry; the verdict on each row."""
-        self.keyframes.update_if_due()
+        self.update_if_due()
         anonymous.forget(self.keyframes.oldest_key(anonymous.longest_wait_s))
         motion = self.keyframes.motion_since_newest(stamp_ns)
         self._merge(anonymous)
@@ -285,7 +284,7 @@ class Sightings:
         paired = anonymous.pair(view, seen.z, seen.cov, taken)
         sightings = self._sightings(view, self._tie(stamp_ns, motion), seen)
         anonymous.use(sightings, paired, self.keyframes.newest_s)
-        self.keyframes.update_if_due()
+        self.update_if_due()
         return {
             row: SightingVerdict(s.outcome, found.innovation, found.S, s.landmark_id, s)
             for row, s, found in zip(seen.rows, sightings, paired, strict=True)

@@ -138,11 +138,10 @@ class Isam2:
                 f"isam2: {', '.join(zero)} must be above zero; give a small value for what is known well"
             )
         self._params = p = params or Isam2Params()
-        self._smoother = Smoother(p.smoother, is_bounded=p.history.policy == "bounded")
-        self._smoother.when_leaving = self._leave
+        self._asked = PoseHistory()
+        self._smoother = Smoother(p.smoother, self._asked if p.history.policy == "bounded" else None)
         self._keyframes = Keyframes(calibration, odometry, p.keyframes, self._smoother)
         self._sightings = Sightings(calibration, p.identity, p.kernel, self._smoother, self._keyframes)
-        self._asked = PoseHistory()
         self._forgot_s = -math.inf
 
     @property
@@ -181,19 +180,18 @@ class Isam2:
                 self._keyframes.advance(int(frame.stamps_ns[0]))
                 self._sightings.add(frame)
         self._keyframes.advance(measurements.end_ns)
-        self._keyframes.update_if_due()
+        self._sightings.update_if_due()
         if self._keyframes.newest_ns is None:
             return None
+        self._forget()
         motion = self._keyframes.motion_since_newest(measurements.end_ns)
         newest = len(self._keyframes.stamps_ns) - 1
         instant = AnchoredPose(measurements.end_ns, newest, self._keyframes.bias_key(newest), motion)
         self._asked.add(instant)
         return instant.carried_on(self._smoother.values, self._smoother.joint_covariance(instant.keys()))
 
-    def _leave(self, keys: set[int]) -> None:
-        """Store estimates of variables that leave a bounded window; drop old ones in batches."""
-        self._asked.leave(keys, self._smoother.values, self._smoother.marginals)
-        self._sightings.leave(keys)
+    def _forget(self) -> None:
+        """Drop old poses and outcomes of a bounded history, in batches."""
         history, now_s = self._params.history, self._keyframes.newest_s
         remembered_s = history.remembered_s if history.policy == "bounded" else None
         if remembered_s is not None and now_s - self._forgot_s > remembered_s / 4:

@@ -24,7 +24,7 @@ from sonar_graph.motion import MotionSource, PreintegratedMotion
 from sonar_graph.navigation.alignment import gravity_direction
 from sonar_graph.numerics import compiled
 from sonar_graph.slam.models import factors
-from sonar_graph.slam.smoother import Smoother
+from sonar_graph.slam.smoother import Changed, Smoother
 from sonar_graph.states import DetectionJournal, Outcome, Refusal, RefusedRow
 
 ROUNDING = 1e-13
@@ -166,11 +166,11 @@ class Keyframes:
             self.stamps_ns.append(start_ns)
             self._bias_since_ns = start_ns
             self.smoother.add_pose(X(0), self.calibration.start.pose(), start_ns * S_PER_NS)
-            self.smoother.add([factors.start_prior(X(0), self.calibration)])
+            self.smoother.add({"start prior": factors.start_prior(X(0), self.calibration)})
             self.bias_keys.append(B(0))
             if self._estimates_bias:
                 self.smoother.add_bias(B(0), np.zeros(3))
-                self.smoother.add([factors.bias_prior(B(0), self.calibration.imu.gyro_bias_sigma)])
+                self.smoother.add({"bias prior": factors.bias_prior(B(0), self.calibration.imu.gyro_bias_sigma)})
             self._constrain(0)
         interval_ns = round(self.params.max_interval_s / S_PER_NS)
         for node_ns in self.odometry.epochs(self.stamps_ns[-1], until_ns).tolist():
@@ -204,10 +204,9 @@ class Keyframes:
             self._latest = until_ns, self.odometry.motion(self.stamps_ns[-1], until_ns, *self._linearised)
         return self._latest[1]
 
-    def update_if_due(self) -> None:
+    def update_if_due(self) -> Changed | None:
         """Bring the smoother up to date when what was added since it last was matters."""
-        if self.smoother.is_due:
-            self.smoother.update(self.newest_s)
+        return self.smoother.update(self.newest_s) if self.smoother.is_due else None
 
     def bias(self, index: int) -> Floats:
         """Newest estimate of the gyro bias that holds from a keyframe on, shape (3,), rad/s."""
@@ -230,29 +229,31 @@ class Keyframes:
             between = factors.odometry_with_bias(X(i), X(j), self.bias_keys[i], motion)
         else:
             between = factors.odometry(X(i), X(j), motion)
-        self.smoother.add([between, *self._gravity(j, node_ns, motion)])
-        self.smoother.add(self._depth(j, start_ns, node_ns, bias))
+        self.smoother.add({"odometry": between})
+        self._add_gravity(j, node_ns, motion)
+        self._add_depth(j, start_ns, node_ns, bias)
         self.bias_keys.append(self._next_bias_key(i, node_ns))
         self.stamps_ns.append(node_ns)
         self._linearised = self._latest = None
         self._constrain(j)
         self.odometry.forget_before(node_ns)
 
-    def _gravity(self, j: int, node_ns: int, motion: PreintegratedMotion) -> list[gtsam.NonlinearFactor]:
+    def _add_gravity(self, j: int, node_ns: int, motion: PreintegratedMotion) -> None:
         if not self.calibration.use_gravity:
-            return []
+            return
         (v_i, variance_i), (v_j, variance_j) = map(self.odometry.velocity_at_imu, (self.stamps_ns[-1], node_ns))
         sigma = float(np.sqrt(0.5 * (variance_i + variance_j)))
         up = gravity_direction(motion, v_i, v_j, sigma, self.calibration.imu, self.calibration.gravity_m_s2)
-        return [factors.gravity_direction(X(j), *up)] if up else []
+        if up:
+            self.smoother.add({"gravity": factors.gravity_direction(X(j), *up)})
 
-    def _depth(self, j: int, start_ns: int, node_ns: int, bias: Floats) -> list[gtsam.NonlinearFactor]:
+    def _add_depth(self, j: int, start_ns: int, node_ns: int, bias: Floats) -> None:
         """One factor for the samples since the last keyframe, carried to this one by odometry and averaged there.
 
         Samples are carried over no gap of the Doppler log. The port at sample k lies at ``k_T_j^-1 port`` in frame j.
         """
         if not self._depths:
-            return []
+            return
         waiting = Depth.concatenate(self._depths)
         later = waiting.between(node_ns, LATEST_NS)
         self._depths = [later] if later else []
@@ -260,7 +261,7 @@ class Keyframes:
         found_ns = [b for a, b in pairwise(epochs_ns) if self.odometry.is_gap(a, b)]
         samples = waiting.between(found_ns[-1] - CARRIED_IN_GAP_NS if found_ns else start_ns, node_ns)
         if samples is None:
-            return []
+            return
         until_ns = np.append(samples.stamps_ns[1:], node_ns)
         known_ns = np.full(len(samples), self.odometry.reached_ns(np.array([node_ns]))[0])
         motions = self.odometry.motions(samples.stamps_ns, until_ns, known_ns, bias)
@@ -274,7 +275,8 @@ class Keyframes:
             ports[k] = k_R_j.T @ (port - k_p_j)
         variance = np.where(np.isnan(samples.variance_m2), self.calibration.depth.sigma_m**2, samples.variance_m2)
         weights, mean_variance = weights_at_end(variance, wander_m2)
-        return [factors.depth(X(j), float(weights @ samples.z_m), weights @ ports, mean_variance**0.5)]
+        z_m = float(weights @ samples.z_m)
+        self.smoother.add({"depth": factors.depth(X(j), z_m, weights @ ports, mean_variance**0.5)})
 
     def _constrain(self, j: int) -> None:
         if self.calibration.planar:
@@ -289,7 +291,7 @@ class Keyframes:
         new = B(gtsam.Symbol(old).index() + 1)
         self._bias_since_ns = node_ns
         self.smoother.add_bias(new, self.smoother.values.atPoint3(old))
-        self.smoother.add([factors.bias_walk(old, new, walk * np.sqrt(elapsed_s))])
+        self.smoother.add({"bias walk": factors.bias_walk(old, new, walk * np.sqrt(elapsed_s))})
         return new
 
 

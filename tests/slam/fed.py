@@ -7,6 +7,7 @@ from gtsam.symbol_shorthand import B, L, X
 
 from sonar_graph.measurements import Floats
 from sonar_graph.slam.models import factors
+from sonar_graph.slam.smoother import Factors
 
 from .graphs import block_of, dense_covariance
 from .made import motion_of, plain, polar, smoother_with
@@ -22,16 +23,22 @@ class Fed:
 
     def __init__(self, lag_s: float, stale_shift_m: float = NEVER_M, *, is_bounded: bool = False) -> None:
         self.smoother = smoother_with(lag_s, 1e-6, stale_shift_m, is_bounded=is_bounded)
-        self.given: list[gtsam.NonlinearFactor] = []
-        self.handles: list[int] = []
+        self.groups: dict[int, Factors] = {}
 
-    def add(self, new: list[gtsam.NonlinearFactor]) -> None:
-        self.given += new
-        self.handles += self.smoother.add(new)
+    def add(self, new: Factors) -> None:
+        self.groups[self.smoother.add(new)] = new
+
+    @property
+    def given(self) -> list[gtsam.NonlinearFactor]:
+        return [factor for group in self.groups.values() for factor in group.values()]
 
     def handles_on(self, *keys: int) -> list[int]:
-        """Of the factors on just these variables."""
-        return [h for h, factor in zip(self.handles, self.given, strict=True) if set(factor.keys()) == set(keys)]
+        """Of the groups on just these variables."""
+        return [
+            handle
+            for handle, group in self.groups.items()
+            if {key for factor in group.values() for key in factor.keys()} == set(keys)  # noqa: SIM118
+        ]
 
     def joint(self, *keys: int) -> Floats:
         return block_of(self.smoother.joint_covariance(list(keys)), list(keys))
@@ -52,7 +59,7 @@ def on_the_rail(
     _, numbers = rail(nodes)
     fed, seen = Fed(lag_s, stale_shift_m, is_bounded=is_bounded), set()
     fed.smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
-    fed.add([factors.start_prior(X(0), calibration())])
+    fed.add({"start prior": factors.start_prior(X(0), calibration())})
     cov = np.diag([1e-12] * 3 + [(VELOCITY_SIGMA_M_S * STEP_S) ** 2] * 3)
     for k in range(1, nodes):
         moved = gtsam.Pose3(gtsam.Rot3(), np.array([numbers.displacements_m[k - 1], 0, 0]))
@@ -60,7 +67,7 @@ def on_the_rail(
         fed.smoother.add_pose(X(k), pose, k * STEP_S)
         if held and X(k) in held:
             fed.smoother.hold(held)
-        fed.add([factors.odometry(X(k - 1), X(k), motion_of(moved, cov))])
+        fed.add({"odometry": factors.odometry(X(k - 1), X(k), motion_of(moved, cov))})
         for _, i, distance in (r for r in numbers.ranges if r[0] == k):
             if i not in seen:
                 fed.smoother.add_landmark(L(i), pose.translation() + distance * np.eye(3)[0])
@@ -70,7 +77,7 @@ def on_the_rail(
     return fed
 
 
-def ranged(k: int, i: int, distance: float, elevation_sigma: float | None = None) -> list[gtsam.NonlinearFactor]:
+def ranged(k: int, i: int, distance: float, elevation_sigma: float | None = None) -> Factors:
     """Factors of a range on the rail."""
     z, R = np.array([distance, 0.0]), np.diag([RANGE_SIGMA_M**2, 1e6])
     return factors.landmark_sighting(X(k), L(i), gtsam.Pose3(), z, R, plain, elevation_sigma)
@@ -99,17 +106,18 @@ def in_the_basin(
     fed.smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
     fed.smoother.add_bias(B(0), np.zeros(3))
     prior = gtsam.noiseModel.Diagonal.Sigmas(np.array([0.01] * 3 + [0.02] * 3))
-    fed.add([gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), prior), factors.bias_prior(B(0), 0.01)])
+    fed.add({"start prior": gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), prior)})
+    fed.add({"bias prior": factors.bias_prior(B(0), 0.01)})
     for k in range(1, steps):
         truth = truth.compose(turn)
         moved = turn.compose(gtsam.Pose3.Expmap(np.sqrt(np.diag(cov)) * rng.standard_normal(6)))
         motion = motion_of(moved, cov, -np.eye(6)[:, :3])
         fed.smoother.add_pose(X(k), fed.smoother.values.atPose3(X(k - 1)).compose(moved), float(k))
-        fed.add([factors.odometry_with_bias(X(k - 1), X(k), B((k - 1) // bias_steps), motion)])
+        fed.add({"odometry": factors.odometry_with_bias(X(k - 1), X(k), B((k - 1) // bias_steps), motion)})
         if k % bias_steps == 0:
             new = k // bias_steps
             fed.smoother.add_bias(B(new), fed.smoother.values.atPoint3(B(new - 1)))
-            fed.add([factors.bias_walk(B(new - 1), B(new), 0.003)])
+            fed.add({"bias walk": factors.bias_walk(B(new - 1), B(new), 0.003)})
         for i, p in landmarks.items():
             z = polar(truth.compose(SONAR), p) + [0.02, 0.009] * rng.standard_normal(2)
             if i not in seen:

@@ -15,6 +15,7 @@ from sonar_graph.navigation import Odometry, PreintegratedMotion
 from sonar_graph.sequence import Sequence
 from sonar_graph.settings import nested
 from sonar_graph.slam import Isam2, Isam2Params
+from sonar_graph.slam.estimates import PoseHistory
 from sonar_graph.slam.smoother import Smoother, SmootherParams
 from sonar_graph.states import Estimate
 
@@ -54,7 +55,7 @@ def smoother_with(
     params = SmootherParams(
         lag_s=lag_s, relinearize_threshold=relinearize_threshold, stale_shift_m=stale_shift_m, waiting_gain=waiting_gain
     )
-    return Smoother(params, is_bounded=is_bounded)
+    return Smoother(params, PoseHistory() if is_bounded else None)
 
 
 def values_of(**named: Any) -> gtsam.Values:

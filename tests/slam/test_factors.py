@@ -52,7 +52,7 @@ def sightings(pose: gtsam.Pose3, rng: np.random.Generator) -> Made:
     azimuth, elevation = rng.uniform([-1.13, -0.12], [1.13, 0.12])
     z, values = np.array([2.0, azimuth + 0.02]), values_of(X0=pose, L0=seen_from(pose, azimuth, elevation, 2.1))
     for cov in (correlated(0.0), correlated(0.5)):
-        for factor in factors.landmark_sighting(X(0), L(0), BODY_T_SONAR, z, cov, plain, 0.07):
+        for factor in factors.landmark_sighting(X(0), L(0), BODY_T_SONAR, z, cov, plain, 0.07).values():
             yield factor, values
 
 
@@ -60,7 +60,7 @@ def attitudes_and_heights(pose: gtsam.Pose3, rng: np.random.Generator) -> Made:
     values, up_in_body = values_of(X0=pose), pose.rotation().matrix().T @ [0, 0, 1.0]
     tilt = gtsam.Rot3.RzRyRx(*rng.uniform(-0.3, 0.3, 2), 0)
     yield factors.depth(X(0), 1.3, np.array([0.3, -0.2, 0.1]), 0.02), values
-    yield from ((factor, values) for factor in factors.planar(X(0), PLANE))
+    yield from ((factor, values) for factor in factors.planar(X(0), PLANE).values())
     tilted = values_of(X0=pose.compose(gtsam.Pose3(tilt, np.zeros(3))))
     yield factors.gravity_direction(X(0), 9.8 * up_in_body, 0.01), tilted
 
@@ -123,7 +123,7 @@ def test_a_sighting_is_range_and_azimuth_whatever_the_elevation(pose, azimuth, e
     shrunk = elevation / np.tan(elevation) if elevation else 1.0
     z = np.array([range_m, azimuth]) - off
     values = values_of(X0=pose, L0=seen_from(pose, azimuth, elevation, range_m))
-    camera, distance = factors.landmark_sighting(X(0), L(0), BODY_T_SONAR, z, np.diag(SIGMA**2), plain)
+    camera, distance = factors.landmark_sighting(X(0), L(0), BODY_T_SONAR, z, np.diag(SIGMA**2), plain).values()
     across, up = camera.whitenedError(values)
     assert across == pytest.approx(off[1] / SIGMA[1] * shrunk, rel=1.1e-4)
     assert shrunk > 0.995
@@ -140,7 +140,7 @@ def test_an_azimuth_is_an_angle_however_wrong_it_is(azimuth, off):
     pose = POSES["random"]
     values = values_of(X0=pose, L0=seen_from(pose, azimuth, 0.0, 2.0))
     z, cov = np.array([2.0, azimuth - off]), np.diag([4e-4, 8e-5])
-    camera = factors.landmark_sighting(X(0), L(0), BODY_T_SONAR, z, cov, plain)[0]
+    camera = factors.landmark_sighting(X(0), L(0), BODY_T_SONAR, z, cov, plain)["azimuth"]
     model = factors.correlated_sighting(X(0), L(0), BODY_T_SONAR, z, cov, plain)
     assert camera.unwhitenedError(values)[0] == pytest.approx(model.unwhitenedError(values)[1], abs=1e-7)
 
@@ -164,7 +164,9 @@ def test_without_an_elevation_a_sighting_says_next_to_nothing_about_it():
     upwards /= np.linalg.norm(upwards)
     values, z, cov = values_of(X0=pose, L0=point), np.array([2.0, 0.2]), np.diag(SIGMA**2)
     silent, told = (
-        information(factors.landmark_sighting(X(0), L(0), BODY_T_SONAR, z, cov, plain, s), values, [L(0), X(0)])[:3, :3]
+        information(
+            factors.landmark_sighting(X(0), L(0), BODY_T_SONAR, z, cov, plain, s).values(), values, [L(0), X(0)]
+        )[:3, :3]
         for s in (None, 0.07)
     )
     assert upwards @ silent @ upwards < 1e-6
@@ -177,7 +179,7 @@ def test_the_robust_kernel_weighs_every_part_of_a_sighting(correlation):
     z, cov = np.array([2.0, 0.0]), correlated(correlation)
     values = values_of(X0=gtsam.Pose3(), L0=np.array([3.0, 0.3, 0.0]))
     robust, quadratic = (
-        graph_of(factors.landmark_sighting(X(0), L(0), gtsam.Pose3(), z, cov, kernel)).error(values)
+        graph_of(factors.landmark_sighting(X(0), L(0), gtsam.Pose3(), z, cov, kernel).values()).error(values)
         for kernel in (huber, plain)
     )
     assert robust < 0.2 * quadratic
@@ -229,9 +231,9 @@ def test_a_gravity_direction_that_does_not_fit_still_says_nothing_of_the_yaw(pos
 
 def test_the_plane_holds_height_roll_and_pitch_and_leaves_the_rest():
     pose = gtsam.Pose3(gtsam.Rot3.Rz(2.0), np.array([5.0, -3.0, 0.4]))
-    said = information(factors.planar(X(0), PLANE), values_of(X0=pose), [X(0)])
+    said = information(factors.planar(X(0), PLANE).values(), values_of(X0=pose), [X(0)])
     assert np.diag(said) == pytest.approx([2500, 2500, 0, 0, 0, 1e4], abs=1e-6)
-    graph = graph_of(factors.planar(X(0), PLANE))
+    graph = graph_of(factors.planar(X(0), PLANE).values())
     assert graph.error(values_of(X0=pose)) < 1e-6
     off = gtsam.Pose3(gtsam.Rot3.Rz(2.0), np.array([5.0, -3.0, 0.43]))
     assert graph.error(values_of(X0=off)) == pytest.approx(4.5, rel=1e-6)
@@ -247,7 +249,7 @@ def test_only_its_first_direction_holds_a_landmark_behind_every_sonar_that_saw_i
     graph: list[gtsam.NonlinearFactor] = []
     for k, pose in enumerate(BLIND_POSES):
         z = np.array([np.linalg.norm(pose.transformTo(values.atPoint3(L(0)))), 0.1])
-        graph += factors.landmark_sighting(X(k), L(0), gtsam.Pose3(), z, np.diag([4e-4, 8e-5]), plain, 0.07)
+        graph += factors.landmark_sighting(X(k), L(0), gtsam.Pose3(), z, np.diag([4e-4, 8e-5]), plain, 0.07).values()
     if is_held:
         graph.append(factors.first_direction(X(0), L(0), np.array([12.0, 1.0, 0.0])))
     held = np.linalg.eigvalsh(information(graph, values, [X(0), X(1), L(0)])[12:, 12:])

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonar_graph.slam.smoother import fixed_lag
-from sonar_graph.slam.smoother.factor_store import GraphEdit, History, Recent
+from sonar_graph.slam.smoother.factor_store import FactorGroup, FactorStore
 from sonar_graph.slam.smoother.fixed_lag import SmootherWindow, marginal, picked
 
 from .graphs import factors_of
@@ -58,7 +58,7 @@ def test_what_lies_outside_counts_once_where_cholesky_gives_up(outside, variance
     inside = graph_of([point_prior(L(2), ORIGIN, WEAK_M), near(2, 3, tight_m)])
     window = SmootherWindow(1e-6, 1e9)
     window.is_by_qr = is_by_qr
-    window.begin_after(outside, solved, inside, picked(solved, [L(2), L(3)]), {L(2): 0.0, L(3): 0.0})
+    window.begin(inside, picked(solved, [L(2), L(3)]), {L(2): 0.0, L(3): 0.0}, (outside, solved))
     expected = 1.0 / (1.0 / WEAK_M**2 + 1.0 / variance_m2)
     assert window.is_by_qr
     assert window.isam.marginalCovariance(L(2)) == pytest.approx(expected * np.eye(3), rel=1e-6)
@@ -71,7 +71,7 @@ def test_a_marginal_holds_where_it_was_made_though_the_window_is_linearised_else
     values = values_of(L2=ORIGIN)
     window = SmootherWindow(1e-6, 1e9)
     window.is_by_qr = is_by_qr
-    window.begin_after(outside, values, inside, values, {L(2): 0.0})
+    window.begin(inside, values, {L(2): 0.0}, (outside, values))
     window.settle()
     assert window.isam.getLinearizationPoint().atPoint3(L(2)) == pytest.approx(np.full(3, 1.5), abs=1e-5)
     assert window.isam.calculateEstimate().atPoint3(L(2)) == pytest.approx(np.full(3, 1.5))
@@ -91,50 +91,45 @@ def test_where_cholesky_gives_up_on_the_marginal_qr_makes_it(monkeypatch: pytest
     smoother, handles = smoother_with(lag_s=0.5), []
     for k, sigma in enumerate([PRIOR_M, 0.1, WEAK_M]):
         smoother.add_pose(X(k), gtsam.Pose3(), float(k))
-        handles += smoother.add([factor(k, sigma)])
+        handles.append(smoother.add({"chain": factor(k, sigma)}))
         if k:
             smoother.update(float(k))
-    smoother.exchange(GraphEdit([handles[0]], [[factor(0, PRIOR_M)]], {}, []), 2.0)
+    smoother.exchange(2.0, handles[:1], [FactorGroup({"prior": factor(0, PRIOR_M)})])
     assert ways == [False, True]
     assert smoother.covariance(X(2)) == pytest.approx((PRIOR_M**2 + 0.1**2 + WEAK_M**2) * np.eye(6), rel=1e-6)
     assert not smoother.withheld
 
 
-@pytest.mark.parametrize("kind", [History, Recent])
 @given(choices=st.lists(st.integers(0, 30), max_size=60))
-def test_what_was_put_in_and_not_taken_out_is_in(kind: type[History] | type[Recent], choices: list[int]):
-    """Each number adds a factor or, where it names one of those that are in, takes that one out."""
-    history, inside = kind(), {}
+def test_what_was_put_in_and_not_taken_out_is_in(choices: list[int]):
+    """Each number adds a group or, where it names one of those that are in, takes that one out."""
+    store, inside = FactorStore(), {}
     for number, choice in enumerate(choices):
         if choice in inside:
-            history.remove([inside.pop(choice)])
+            store.remove([inside.pop(choice)])
         else:
-            inside[choice] = history.add(point_prior(L(choice), ORIGIN))
-        assert sorted(f.keys()[0] for f in factors_of(history.graph)) == sorted(map(L, inside))
-        assert history.changes == number + 1
+            prior = point_prior(L(choice), ORIGIN)
+            inside[choice] = store.add(FactorGroup({"one": prior, "two": prior}, (L(choice), number)))
+        assert [f.keys()[0] for f in factors_of(store.graph())][::2] == [L(named) for named in inside]
+        assert store.size == store.graph().size() == 2 * len(inside)
+        assert store.sightlines().keys() == set(map(L, inside))
         for named, handle in inside.items():
-            assert history.factor(handle).keys()[0] == L(named)
+            assert [f.keys()[0] for f in store.factors([handle])] == [L(named)] * 2
+        assert store.graph(left_out=set(list(inside.values())[1:])).size() == 2 * bool(inside)
 
 
-def test_what_has_left_is_in_marginals_and_what_waits_beside_them():
-    """A handle ends with the first pose or bias of its factor that leaves; those on landmarks alone stay."""
-    recent = Recent()
-    lone, old = recent.add(point_prior(L(3), ORIGIN)), recent.add(factor(1, 1.0))
-    walk = recent.add(gtsam.BetweenFactorPoint3(B(0), B(1), ORIGIN, isotropic(3, 1.0)))
-    new = recent.add(factor(2, 1.0))
-    window = graph_of(recent.factor(handle) for handle in (lone, walk, new))
-    recent.keep(window, gtsam.Values(), [X(0)])
-    changes = recent.changes
-    assert recent.graph.size() == 3
+def test_a_group_leaves_with_its_oldest_pose_or_bias_and_those_on_landmarks_alone_stay():
+    store = FactorStore()
+    walk = gtsam.BetweenFactorPoint3(B(0), B(1), ORIGIN, isotropic(3, 1.0))
+    made = {"prior": point_prior(L(3), ORIGIN), "old": factor(1, 1.0), "walk": walk, "odometry": factor(2, 1.0)}
+    lone, old, walked, later = (store.add(FactorGroup({name: each})) for name, each in made.items())
+    store.leave([X(0)])
+    assert store.graph().size() == store.size == 3
     with pytest.raises(KeyError):
-        recent.factor(old)
-    assert recent.factor(new).equals(window.at(2), 0)
-    waiting = recent.add(point_prior(L(4), ORIGIN))
-    assert recent.graph.size() == 4
-    recent.remove([new, waiting])
-    assert recent.graph.size() == 2
-    assert recent.changes == changes + 3
-    recent.keep(window, gtsam.Values(), [B(0)])
+        store.factors([old])
+    store.remove([later])
+    store.leave([B(0), X(1)])
+    assert store.factors([lone]) == [made["prior"]]
+    assert store.size == 1
     with pytest.raises(KeyError):
-        recent.factor(walk)
-    assert recent.factor(lone).equals(window.at(0), 0)
+        store.factors([walked])

@@ -230,11 +230,11 @@ def test_sightings_wait_until_together_they_have_something_to_tell():
     for _ in range(6):
         known.append(0.02**2 / range_variance(dive))
         dive.see(0.0, (5, 3.0, 0.0))
-        waited.append(dive.smoother.waiting_gain)
+        waited.append(dive.smoother._waiting_gain)
     assert known == pytest.approx([1, 2, 3, 3, 5, 5], rel=1e-3)
     assert waited == pytest.approx([0, 0, 1 / 3, 0, 1 / 5, 2 / 5], rel=1e-3, abs=1e-9)
     dive.see(0.0, (5, 9.0, 0.0))
-    assert dive.smoother.waiting_gain == waited[-1]
+    assert dive.smoother._waiting_gain == waited[-1]
     assert dive.outcomes == [Outcome.NEW] + [Outcome.USED] * 6 + [Outcome.GATED]
 
 

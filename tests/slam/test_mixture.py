@@ -103,7 +103,7 @@ def losses(kernel: Kernel, noise: Floats) -> Floats:
     estimator, values, found = kernel.estimator(), values_of(X0=gtsam.Pose3(), L7=np.zeros(3)), []
     z = np.array([3.0, 0.2])
     robust = (lambda model: gtsam.noiseModel.Robust.Create(estimator, model)) if estimator else plain
-    made = factors.landmark_sighting(X(0), L(7), gtsam.Pose3(), z, noise, robust)
+    made = factors.landmark_sighting(X(0), L(7), gtsam.Pose3(), z, noise, robust).values()
     errors = Errors([Sighting(0, 0, Sightline(X(0), gtsam.Pose3(), z), noise, None)], values)
     for size, angle in product([0.3, 1.0, 3.0, 12.0], np.linspace(0.0, 2 * np.pi, 13)):
         r, a = z + np.linalg.cholesky(noise) @ (size * np.array([np.cos(angle), np.sin(angle)]))

@@ -26,7 +26,7 @@ from .test_mixture_policy import PLACES, dive, show, watch
 
 def rival_of(world: Dive) -> RivalHistory:
     doubtful = world.sightings._doubtful
-    handles = {handle for w in doubtful.watches for s in w.sightings for handle in s.handles}
+    handles = {s.handle for w in doubtful.watches for s in w.sightings}
     return RivalHistory(
         world.smoother.graph_without(handles), doubtful.watches, doubtful._mixture, doubtful._landmarks.maker
     )
@@ -168,10 +168,10 @@ def test_each_watch_counts_by_its_weight_and_the_beginning_of_landmarks_in_full(
     weighed = WeighedHistory(rest, watches, WEIGHED, MAKER)
     first = {7: watches[2].sightings[0], 9: watches[3].sightings[0]}
     said_once = rest.error(values) + sum(
-        factor.error(values) for i, sighting in first.items() for factor in MAKER.beginning(sighting, L(i))
+        factor.error(values) for i, sighting in first.items() for factor in MAKER.beginning(sighting, L(i)).values()
     )
     alone = [
-        sum(factor.error(values) for sighting in each.sightings for factor in MAKER.measured(sighting, L(i)))
+        sum(factor.error(values) for sighting in each.sightings for factor in MAKER.measured(sighting, L(i)).values())
         for each, i in zip(watches, WEIGHED, strict=True)
     ]
     for weights in ([1.0, 1.0, 1.0, 1.0], [0.0, 1.0, 0.3, 0.02], [0.5, 0.25, 0.0, 0.9]):
@@ -181,7 +181,7 @@ def test_each_watch_counts_by_its_weight_and_the_beginning_of_landmarks_in_full(
     for each, i in zip(watches, WEIGHED, strict=True):
         for sighting in each.sightings:
             is_first = sighting in (watches[2].sightings[0], watches[3].sightings[0])
-            for factor in MAKER.make(sighting, L(i), is_first=is_first):
+            for factor in MAKER.make(sighting, L(i), is_first=is_first).values():
                 made.push_back(factor)
     ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(made)
     as_made, with_ones = (g.linearize(values).hessian(ordering) for g in (made, weighed.graph(np.ones(4))))

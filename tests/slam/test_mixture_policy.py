@@ -69,7 +69,7 @@ def worst_landmark_m(world: Dive) -> float:
 def max_mixture(world: Dive) -> gtsam.NonlinearFactorGraph:
     """The same with Python factors that look for their largest component at every linearisation."""
     doubtful = world.sightings._doubtful
-    handles = {h for w in doubtful.watches for s in w.sightings for h in s.handles}
+    handles = {s.handle for w in doubtful.watches for s in w.sightings}
     graph, chosen = world.smoother.graph_without(handles), doubtful.history()
     pairs = list(zip(chosen.watches, chosen.choices, strict=True))
     firsts = {i: min(w.sightings[0].row for w, choice in pairs if choice == i) for i in PLACES}
@@ -78,7 +78,7 @@ def max_mixture(world: Dive) -> gtsam.NonlinearFactorGraph:
         first_of = next((i for i, row in firsts.items() if row == sighting.row), None)
         maker = doubtful._maker
         if first_of is not None:  # what is said once of a landmark does not depend on a choice
-            for factor in maker.make(sighting, L(first_of), is_first=True)[2:]:
+            for factor in list(maker.make(sighting, L(first_of), is_first=True).values())[2:]:
                 graph.push_back(factor)
         graph.push_back(
             largest(w.statement.favourite, {i: maker.make(sighting, L(i), is_first=False) for i in PLACES}, sighting)
@@ -86,7 +86,7 @@ def max_mixture(world: Dive) -> gtsam.NonlinearFactorGraph:
     return graph
 
 
-def largest(named: int, components: dict[int, list], sighting) -> gtsam.CustomFactor:
+def largest(named: int, components: dict[int, dict], sighting) -> gtsam.CustomFactor:
     keys = [sighting.line.pose_key, *(L(i) for i in PLACES)]
     q, u = 0.05, 1.0 / (10.0 * 2.0)
     peak = 1.0 / (2.0 * np.pi * np.sqrt(np.linalg.det(sighting.noise)))
@@ -96,14 +96,14 @@ def largest(named: int, components: dict[int, list], sighting) -> gtsam.CustomFa
         best, cost = None, least
         for i, factors in components.items():
             weight = (1 - q) * (i == named) + q / 40
-            own = 2 * sum(f.error(values) for f in factors) - 2 * np.log(weight / (1 - q + q / 40))
+            own = 2 * sum(f.error(values) for f in factors.values()) - 2 * np.log(weight / (1 - q + q / 40))
             if own < cost:
                 best, cost = i, own
         e, blocks = np.zeros(4), {key: np.zeros((4, 6 if key == keys[0] else 3)) for key in keys}
         e[3] = np.sqrt(least)
         if best is not None:
-            e[3] = np.sqrt(max(cost - 2 * sum(f.error(values) for f in components[best]), 0.0))
-            camera, distance = components[best]
+            e[3] = np.sqrt(max(cost - 2 * sum(f.error(values) for f in components[best].values()), 0.0))
+            camera, distance = components[best].values()
             for rows, factor in ((slice(0, 2), camera), (slice(2, 3), distance)):
                 A, b = factor.linearize(values).jacobian()
                 e[rows], column = -b, 0
@@ -297,17 +297,17 @@ def test_a_detection_of_a_known_track_gets_its_landmark_also_where_another_is_ne
 def test_a_misfit_is_one_of_the_identity_only_where_the_estimate_is_sure(sigma_m: float, stays: bool) -> None:
     """Seen 0.3 m off from a second pose: as it stands, it is of nothing; expected with the pose's error, it may be."""
     smoother = smoother_with(1e9, 0.1, 1e9)
-    landmarks = LandmarkSightings(smoother, SightingFactors(SonarCalibration(), plain))
+    landmarks = LandmarkSightings(smoother, SightingFactors(SonarCalibration(), plain), DetectionJournal())
     for k, sigma in enumerate((0.001, sigma_m)):
         smoother.add_pose(X(k), gtsam.Pose3(), float(k))
         sigmas = np.array([1e-3] * 3 + [sigma] * 3)
-        smoother.add([gtsam.PriorFactorPose3(X(k), gtsam.Pose3(), gtsam.noiseModel.Diagonal.Sigmas(sigmas))])
+        smoother.add({"prior": gtsam.PriorFactorPose3(X(k), gtsam.Pose3(), gtsam.noiseModel.Diagonal.Sigmas(sigmas))})
     smoother.update(1.0)
     floor = FloorPrior(z_m=0.0, sigma_m=0.01)
     for k in range(2):
         landmarks.exchange([], [(sighting(k, [3.0, 0.1], floor=floor), 7)], 1.0)
     off = sighting(2, [3.3, 0.1], 1, floor)
-    landmarks.enter(off, 7, ())
+    landmarks._enter(off, 7, None)
     seen, journal = TrackedObject(IdentityPosterior({7: 0.9}), [off]), DetectionJournal()
     off.row = journal.record(off.stamp_ns, 7, Outcome.USED)
     doubtful = DoubtfulIdentities(landmarks, journal, MixtureIdentity(), MIXTURE)

@@ -18,7 +18,7 @@ from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 from sonar_graph.slam import Isam2
 from sonar_graph.slam.landmarks.sighting import SightingFactors
 from sonar_graph.slam.models import factors
-from sonar_graph.slam.smoother.factor_store import GraphEdit
+from sonar_graph.slam.smoother.factor_store import FactorGroup, Factors
 from sonar_graph.slam.smoother.incremental import Smoother
 from sonar_graph.slam.smoother.observability import LEAST_SAID, left_open
 from sonar_graph.states import Estimate, Outcome, Refusal
@@ -176,17 +176,20 @@ def begun(*, is_bounded: bool = False, by_qr: bool = False) -> Smoother:
         smoother._window.is_by_qr = True
         smoother._window.isam = smoother._window._empty()
     smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
-    smoother.add([gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), SIGMAS)])
+    smoother.add({"prior": gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), SIGMAS)})
     smoother.add_landmark(L(3), np.array([4.0, 1.0, 0.5]))
-    smoother.add([point_prior(L(3), [4.1, 1.0, 0.5]), range_factor(0, 3, 4.3)])
+    smoother.add({"prior": point_prior(L(3), [4.1, 1.0, 0.5])})
+    smoother.add({"range": range_factor(0, 3, 4.3)})
     smoother.update(0.0)
     step(smoother, 1)
     return smoother
 
 
-def step(smoother: Smoother, k: int, *more: gtsam.NonlinearFactor) -> None:
+def step(smoother: Smoother, k: int, more: Factors | None = None) -> None:
     smoother.add_pose(X(k), smoother.values.atPose3(X(k - 1)).compose(STEP), float(k))
-    smoother.add([gtsam.BetweenFactorPose3(X(k - 1), X(k), STEP, SIGMAS), range_factor(k, 3, 4.0 - 0.7 * k), *more])
+    smoother.add({"odometry": gtsam.BetweenFactorPose3(X(k - 1), X(k), STEP, SIGMAS)})
+    smoother.add({"range": range_factor(k, 3, 4.0 - 0.7 * k)})
+    smoother.add(more or {})
     smoother.update(float(k))
 
 
@@ -206,10 +209,18 @@ OF_7, FROM_1 = {L(7): POINT}, r"from keyframe 1 at 1\.000 s: 1"
 MISSING = "an elevation, a floor prior or a view from elsewhere is missing"
 SIGHTING = factors.landmark_sighting(X(1), L(7), gtsam.Pose3(), np.array([4.0, 0.05]), np.diag([1e-4, 1e-4]), plain)
 FAULTY = {
-    "lone range": (OF_7, [range_factor(1, 7, 3.0)], rf"landmark 7, {FROM_1} range; open: .*; {MISSING}"),
+    "lone range": (OF_7, {"range": range_factor(1, 7, 3.0)}, rf"landmark 7, {FROM_1} range; open: .*; {MISSING}"),
     "no elevation": (OF_7, SIGHTING, rf"landmark 7, {FROM_1} azimuth, 1 range; open: mostly z \(.*\); {MISSING}"),
-    "no number": ({}, [range_factor(1, 3, np.nan)], rf"landmark 3, {FROM_1} range gives an error that is no number"),
-    "infinite": (OF_7, [point_prior(L(7), [5.0, np.inf, 0.0])], "landmark 7: 1 prior gives an error that is no number"),
+    "no number": (
+        {},
+        {"range": range_factor(1, 3, np.nan)},
+        rf"landmark 3, {FROM_1} range gives an error that is no number",
+    ),
+    "infinite": (
+        OF_7,
+        {"prior": point_prior(L(7), [5.0, np.inf, 0.0])},
+        "landmark 7: 1 prior gives an error that is no number",
+    ),
 }
 WAYS = list(product(FAULTY, ("update", "update by QR", "flush", "exchange")))
 for by in ("update by QR", "flush"):  # QR solves what sigmas of a thousand radians leave; flushed it is linearised anew
@@ -225,8 +236,8 @@ def test_what_has_no_solution_is_withheld_by_name_whichever_way_it_comes(fault, 
     if not way.startswith("update"):
         step(smoother, 2)
     if way == "exchange":
-        smoother.exchange(GraphEdit([], [list(new)], dict(landmarks), []), 2.0)
-        other.exchange(GraphEdit([], [[]], {}, []), 2.0)
+        smoother.exchange(2.0, (), [FactorGroup(new)], landmarks)
+        other.exchange(2.0, (), [FactorGroup({})])
     elif landmarks:
         smoother.add_landmark(L(7), POINT)
     if way == "flush":
@@ -234,7 +245,7 @@ def test_what_has_no_solution_is_withheld_by_name_whichever_way_it_comes(fault, 
         smoother.flush(2.0)
         other.flush(2.0)
     elif way != "exchange":
-        step(smoother, 2, *new)
+        step(smoother, 2, new)
     for k in range(3, 6):
         step(smoother, k)
         step(other, k)
@@ -247,9 +258,9 @@ def test_what_has_no_solution_is_withheld_by_name_whichever_way_it_comes(fault, 
 def test_a_landmark_that_was_withheld_can_come_again():
     smoother, lone = begun(), range_factor(1, 7, 3.0)
     smoother.add_landmark(L(7), POINT)
-    step(smoother, 2, lone)
+    step(smoother, 2, {"range": lone})
     smoother.add_landmark(L(7), POINT)
-    smoother.add([range_factor(2, 7, 3.0), point_prior(L(7), POINT)])
+    smoother.add({"range": range_factor(2, 7, 3.0), "prior": point_prior(L(7), POINT)})
     smoother.update(2.0)
     assert len(smoother.withheld) == 1
     assert smoother.covariance(L(7))[0, 0] < 0.011
@@ -258,7 +269,7 @@ def test_a_landmark_that_was_withheld_can_come_again():
 def test_a_keyframe_without_odometry_is_named_with_what_is_missing():
     smoother = begun()
     smoother.add_pose(X(2), gtsam.Pose3(), 2.0)
-    smoother.add([range_factor(2, 3, 3.0)])
+    smoother.add({"range": range_factor(2, 3, 3.0)})
     with pytest.raises(EstimatorError, match=r"keyframe 2 at 2\.000 s: 1 range; open: .*; odometry from another"):
         smoother.update(2.0)
 
@@ -276,7 +287,7 @@ def test_a_sighting_that_places_no_landmark_is_withheld_and_its_landmark_begins_
     def without_once(self, sighting, key):
         if sighting.stamp_ns == stamps[row] and key == L(ids[row]):
             faulty.append(key)
-            return []
+            return {}
         return beginning(self, sighting, key)
 
     expected, others = run(without(row), history)
@@ -305,7 +316,7 @@ def test_all_factors_of_a_sighting_go_with_the_one_that_is_no_number(monkeypatch
     def spoilt(self, sighting, key, *, is_first):
         made = make(self, sighting, key, is_first=is_first)
         if sighting.stamp_ns == stamps[row] and key == L(ids[row]):
-            return [*made[:-1], gtsam.RangeFactor3D(sighting.line.pose_key, key, np.nan, isotropic(1, 0.1))]
+            return {**made, "range": gtsam.RangeFactor3D(sighting.line.pose_key, key, np.nan, isotropic(1, 0.1))}
         return made
 
     monkeypatch.setattr(SightingFactors, "make", spoilt)

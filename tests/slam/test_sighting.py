@@ -13,7 +13,9 @@ from scipy.optimize import least_squares
 from sonar_graph.calibration import FloorPrior, SonarCalibration
 from sonar_graph.measurements import Floats
 from sonar_graph.slam.landmarks.sighting import LandmarkSightings, Sighting, SightingFactors, place
+from sonar_graph.slam.smoother import Changed
 from sonar_graph.slam.smoother.batch_solution import Sightline
+from sonar_graph.states import DetectionJournal
 
 from .made import graph_of, plain, polar, pose_prior, smoother_with, values_of
 
@@ -31,9 +33,9 @@ def begun() -> LandmarkSightings:
     for k in range(POSES):
         pose = gtsam.Pose3(gtsam.Rot3.Ypr(0.1 * k, 0.2, 0.0), np.array([0.2 * k, 0.1 * k, 0.0]))
         smoother.add_pose(X(k), pose, float(k))
-        smoother.add([pose_prior(X(k), pose, 0.01)])
+        smoother.add({"prior": pose_prior(X(k), pose, 0.01)})
     smoother.update(float(POSES))
-    return LandmarkSightings(smoother, MAKER)
+    return LandmarkSightings(smoother, MAKER, DetectionJournal())
 
 
 def sighting_of(landmark_id: int, k: int, floor: FloorPrior | None, landmarks: LandmarkSightings) -> Sighting:
@@ -72,7 +74,7 @@ def test_whatever_came_and_went_the_graph_is_that_of_what_is_left(floor: FloorPr
         for i in ids:
             mine = sorted((s for s, landmark in of.items() if landmark == i), key=lambda s: s.stamp_ns)
             for s in mine:
-                expected.push_back(graph_of(MAKER.make(s, L(i), is_first=s is mine[0])))
+                expected.push_back(graph_of(MAKER.make(s, L(i), is_first=s is mine[0]).values()))
         assert landmarks.smoother.graph.nrFactors() == expected.nrFactors()
         assert errors(landmarks.smoother.graph, ids, landmarks) == pytest.approx(errors(expected, ids, landmarks))
         assert sorted(landmarks.ids) == landmarks.smoother.landmark_ids == ids
@@ -85,10 +87,12 @@ def test_what_is_said_once_is_said_by_the_earliest(earliest_first: bool) -> None
     early, middle, late = (sighting_of(7, k, None, landmarks) for k in (0, 2, 4))
     for s in (early, middle, late) if earliest_first else (late, middle, early):
         landmarks.exchange([], [(s, 7)], float(POSES))
-    counts = [len(s.handles) for s in (early, middle, late)]
+    store = landmarks.smoother._store
+    counts = [len(store.factors([s.handle])) for s in (early, middle, late)]
     assert counts == [3, 2, 2]  # first_direction beside range and azimuth
     landmarks.exchange([early], [], float(POSES))
-    assert [len(s.handles) for s in (early, middle, late)] == [0, 3, 2]
+    assert early.handle is None
+    assert [len(store.factors([s.handle])) for s in (middle, late)] == [3, 2]
 
 
 def test_a_landmark_whose_sightings_have_left_counts_as_one_more() -> None:
@@ -98,7 +102,7 @@ def test_a_landmark_whose_sightings_have_left_counts_as_one_more() -> None:
     other = sighting_of(9, 3, None, landmarks)
     landmarks.exchange([], [(first, 7), (second, 7), (third, 7), (other, 9)], float(POSES))
     assert landmarks.sizes() == {7: 3, 9: 1}
-    landmarks.leave({X(0), X(1)})
+    landmarks.follow(Changed([], set(), {X(0), X(1)}))
     assert landmarks.sizes() == {7: 2, 9: 1}
     assert landmarks.is_rooted(7)
     assert not landmarks.is_rooted(9)

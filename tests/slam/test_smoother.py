@@ -9,7 +9,7 @@ from sonar_graph.calibration import Calibration, Start
 from sonar_graph.slam.models import factors
 from sonar_graph.slam.smoother import batch_solution
 from sonar_graph.slam.smoother.batch_solution import solve
-from sonar_graph.slam.smoother.factor_store import GraphEdit
+from sonar_graph.slam.smoother.factor_store import FactorGroup
 from sonar_graph.slam.smoother.incremental import FIRST_RESTART
 
 from .fed import FOREVER_S, NEVER_M, SONAR, Fed, assert_is_least_squares, in_the_basin, on_the_rail, ranged
@@ -37,9 +37,9 @@ def test_on_the_rail_window_and_history_are_least_squares(lag_s):
 def test_factors_wait_until_they_are_worth_an_update_and_the_history_is_solved_anew():
     fed = in_the_basin(5, 6.0)
     before, smoothed = (of.atPoint3(L(3)) for of in (fed.smoother.values, fed.smoother.solve_history()[0]))
-    fed.add([point_prior(L(3), np.zeros(3), 0.01)])
+    fed.add({"prior": point_prior(L(3), np.zeros(3), 0.01)})
     assert not fed.smoother.is_due
-    fed.smoother.waiting_gain += 0.1
+    fed.smoother.add({}, gain=0.1)
     assert fed.smoother.is_due
     assert np.array_equal(fed.smoother.values.atPoint3(L(3)), before)
     fed.smoother.update(4.0)
@@ -55,10 +55,10 @@ def test_biases_in_a_row_are_least_squares(lag_s):
     A, b = [np.eye(8)[0] / sigma], [0.0]
     for k in range(8):
         smoother.add_pose(X(k), gtsam.Pose3(), float(k))
-        smoother.add([pose_prior(X(k), gtsam.Pose3(), 1.0)])
+        smoother.add({"prior": pose_prior(X(k), gtsam.Pose3(), 1.0)})
         smoother.add_bias(B(k), np.zeros(3))
-        smoother.add([factors.bias_walk(B(k - 1), B(k), walk) if k else factors.bias_prior(B(0), sigma)])
-        smoother.add([point_prior(B(k), np.full(3, np.sin(k)), reading)])
+        smoother.add({"walk": factors.bias_walk(B(k - 1), B(k), walk) if k else factors.bias_prior(B(0), sigma)})
+        smoother.add({"prior": point_prior(B(k), np.full(3, np.sin(k)), reading)})
         smoother.update(float(k))
         if k:
             A.append((np.eye(8)[k] - np.eye(8)[k - 1]) / walk)
@@ -94,7 +94,7 @@ def test_covariances_are_computed_once_an_update_for_all_that_was_asked_for_late
 def test_covariances_are_those_of_where_the_window_has_settled():
     """A landmark that is pulled away by decimetres lies at other angles to all that see it."""
     fed, keys = in_the_basin(12, FOREVER_S), [X(11), L(3)]
-    fed.add([point_prior(L(5), np.array([2.6, 4.3, -0.8]), 0.01)])
+    fed.add({"prior": point_prior(L(5), np.array([2.6, 4.3, -0.8]), 0.01)})
     fed.smoother.update(11.0)
     fed.joint(*keys)
     fed.smoother.settle(11.0)
@@ -133,8 +133,8 @@ def test_what_is_taken_out_was_never_there(monkeypatch, lag_s, oldest, solves):
     gone = [(k, i) for k in range(oldest, NODES) for i in (4, 7)]
     solved = counted(monkeypatch, batch_solution, "solve")
     removed = [handle for k, i in gone for handle in fed.handles_on(X(k), L(i))]
-    assert len(removed) == 2 * len(gone)
-    fed.smoother.exchange(GraphEdit(removed, [], {}, []), END_S)
+    assert len(removed) == len(gone)
+    fed.smoother.exchange(END_S, removed)
     assert len(solved) == solves
     assert_all_is_least_squares(fed, with_ranges(gone))
 
@@ -163,7 +163,7 @@ def test_after_wrong_factors_are_taken_out_the_estimate_is_that_of_the_others_at
         values = fed.smoother.values
         z = polar(values.atPose3(X(k)).compose(SONAR), values.atPoint3(L(3))) + np.array([2.0, 0.5])
         new = factors.landmark_sighting(X(k), L(3), SONAR, z, np.diag([1e-4, 1e-4]), plain)
-        wrong += fed.smoother.add(new)
+        wrong.append(fed.smoother.add(new))
     for _ in range(5):
         fed.smoother.update(14.0)
     batch = solve(graph_of(fed.given), fed.smoother.values)
@@ -171,7 +171,7 @@ def test_after_wrong_factors_are_taken_out_the_estimate_is_that_of_the_others_at
     solved = counted(monkeypatch, batch_solution, "solve")
     if gives_up:
         fed.smoother._window.isam = Refusing(fed.smoother._window.isam)
-    fed.smoother.exchange(GraphEdit(wrong, [], {}, []), 14.0)
+    fed.smoother.exchange(14.0, wrong)
     off_m.append(np.linalg.norm(fed.smoother.values.atPoint3(L(3)) - batch.atPoint3(L(3))))
     assert off_m[0] > 0.5
     assert off_m[1] < 1e-3 * off_m[0]
@@ -181,21 +181,21 @@ def test_after_wrong_factors_are_taken_out_the_estimate_is_that_of_the_others_at
 def test_a_landmark_without_factors_leaves_the_graph_and_can_come_back():
     fed, gone = on_the_rail(NODES, 2.6), [(k, 7) for k in range(1, NODES)]
     removed = [handle for k, i in gone for handle in fed.handles_on(X(k), L(i))]
-    fed.smoother.exchange(GraphEdit(removed, [], {}, [L(7)]), END_S)
+    fed.smoother.exchange(END_S, removed, lost_landmarks=[L(7)])
     assert_all_is_least_squares(fed, with_ranges(gone), (4,))
     assert not fed.smoother.values.exists(L(7))
     (distance,) = (r for k, i, r in NUMBERS.ranges if (k, i) == (NODES - 1, 7))
     point = fed.smoother.values.atPose3(X(NODES - 1)).translation() + distance * np.eye(3)[0]
-    fed.smoother.exchange(GraphEdit([], [ranged(NODES - 1, 7, distance, 3e-4)], {L(7): point}, []), END_S)
+    fed.smoother.exchange(END_S, (), [FactorGroup(ranged(NODES - 1, 7, distance, 3e-4))], {L(7): point})
     assert_all_is_least_squares(fed, with_ranges(gone[:-1]))
 
 
 def test_a_held_keyframe_takes_late_factors_without_solving_the_history(monkeypatch):
     fed, solved = on_the_rail(NODES, 0.6, held={X(3): FOREVER_S}), counted(monkeypatch, batch_solution, "solve")
-    (handles,) = fed.smoother.exchange(GraphEdit([], [ranged(3, 4, 24.0)], {}, []), END_S)
+    handles = fed.smoother.exchange(END_S, (), [FactorGroup(ranged(3, 4, 24.0))]).added
     assert not solved
     assert_all_is_least_squares(fed, with_ranges([], (3, 4, 24.0)))
-    fed.smoother.exchange(GraphEdit(handles, [], {}, []), END_S)
+    fed.smoother.exchange(END_S, handles)
     assert len(solved) == 1  # that of the smoothed result above
     assert_all_is_least_squares(fed, NUMBERS)
 
@@ -220,7 +220,7 @@ def test_a_hold_that_is_over_ends_at_an_exchange_only_where_what_left_can_be_tak
     numbers, removed = with_ranges([(3, 4)], late, waiting), fed.handles_on(X(3), L(4))
     fed.add(ranged(*waiting))
     fed.smoother.hold({})
-    fed.smoother.exchange(GraphEdit(removed, [ranged(*late)], {}, []), END_S + later_s)
+    fed.smoother.exchange(END_S + later_s, removed, [FactorGroup(ranged(*late))])
     assert fed.smoother.in_window([X(3)]) == ([X(3)] if is_bounded else [])
     assert_is_least_squares(fed, numbers, NODES)
     fed.smoother.update(END_S + later_s)
@@ -234,11 +234,11 @@ def test_a_held_keyframe_stays_however_its_time_is_rounded(start_s: float, is_bo
     """Its age is exactly the lag then; differences of times near 0 are rounded up as often as down."""
     smoother = smoother_with(2.0, 1e-3, 1e9, is_bounded=is_bounded)
     smoother.add_pose(X(0), gtsam.Pose3(), start_s)
-    smoother.add([pose_prior(X(0), gtsam.Pose3(), 0.1)])
+    smoother.add({"prior": pose_prior(X(0), gtsam.Pose3(), 0.1)})
     smoother.hold({X(0): np.inf})
     for k in range(1, 400):
         smoother.add_pose(X(k), gtsam.Pose3(), start_s + 0.1 * k)
-        smoother.add([gtsam.BetweenFactorPose3(X(k - 1), X(k), gtsam.Pose3(), isotropic(6, 0.1))])
+        smoother.add({"odometry": gtsam.BetweenFactorPose3(X(k - 1), X(k), gtsam.Pose3(), isotropic(6, 0.1))})
         smoother.update(start_s + 0.1 * k)
         assert smoother.in_window([X(0)]) == [X(0)]
     smoother.hold({})
@@ -278,7 +278,7 @@ def test_drift_beyond_what_cholesky_takes_is_survived():
     given = [gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), wide), *steps]
     for k, factor in enumerate(given):
         smoother.add_pose(X(k), gtsam.Pose3(), float(k))
-        smoother.add([factor])
+        smoother.add({"chain": factor})
         smoother.update(float(k))
     with pytest.raises(RuntimeError, match="Indeterminate"):
         gtsam.ISAM2().update(graph_of(given), smoother.values)
@@ -292,9 +292,10 @@ def test_the_window_restarts_once_a_landmark_has_moved_by_the_stale_shift(monkey
     solved = counted(monkeypatch, batch_solution, "solve")
     smoother = smoother_with(1e9, 1.0, 0.1)
     smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
-    smoother.add([pose_prior(X(0), gtsam.Pose3(), 1e-6)] * FIRST_RESTART)
+    for _ in range(FIRST_RESTART):
+        smoother.add({"prior": pose_prior(X(0), gtsam.Pose3(), 1e-6)})
     smoother.add_landmark(L(1), np.zeros(3))
-    smoother.add([point_prior(L(1), [shift_m, 0.0, 0.0], 0.01)])
+    smoother.add({"prior": point_prior(L(1), [shift_m, 0.0, 0.0], 0.01)})
     smoother.update(0.0)
     assert bool(solved) == is_due
 
@@ -305,7 +306,7 @@ def test_a_start_that_is_hardly_known_is_smoothed_to_the_end(monkeypatch):
     calibration_ = Calibration(start=Start(position_sigma_m=(100.0,) * 3))
     fed = Fed(30.0, stale_shift_m=1e-9)
     fed.smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
-    fed.add([factors.start_prior(X(0), calibration_)])
+    fed.add({"start prior": factors.start_prior(X(0), calibration_)})
     cov, step = np.diag([1e-10] * 3 + [1e-6] * 3), gtsam.Pose3(gtsam.Rot3.Rz(0.02), np.array([0.1, 0.0, 0.0]))
     motion = motion_of(step, cov)
     truth, landmark = gtsam.Pose3(), np.array([3.0, 1.0, -1.0])
@@ -314,7 +315,7 @@ def test_a_start_that_is_hardly_known_is_smoothed_to_the_end(monkeypatch):
         truth = truth.compose(step)
         fed.smoother.add_pose(X(k), fed.smoother.values.atPose3(X(k - 1)).compose(step), float(k))
         z = polar(truth.compose(SONAR), landmark)
-        fed.add([factors.odometry(X(k - 1), X(k), motion)])
+        fed.add({"odometry": factors.odometry(X(k - 1), X(k), motion)})
         fed.add(factors.landmark_sighting(X(k), L(1), SONAR, z, np.diag([4e-4, 8e-5]), plain, 0.3 if k == 1 else None))
         fed.smoother.update(float(k))
     assert len(solved) > 2

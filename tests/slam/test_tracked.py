@@ -221,7 +221,7 @@ def test_a_landmark_may_begin_late_while_what_waits_makes_the_window_restart(mon
 
 def test_while_sightings_wait_the_window_stays_open_for_them(monkeypatch):
     """Late factors then cost no solution of the history; of a track that is of no landmark they may."""
-    solves = counted(monkeypatch, Smoother, "_solve")
+    solves = counted(monkeypatch, smoother_module, "solve_in_sight")
     for beliefs, expected in (([FLAT] * 9, 0), ([FLAT] * 2 + [[0.0] * 4] * 7, 1)):
         dive = Dive(lag_s=0.5)
         solves.clear()

@@ -179,9 +179,9 @@ def anonymous(
     """A known pose, and a landmark straight ahead."""
     smoother = smoother_with(1e9, 0.1, 1e9)
     maker = SightingFactors(SonarCalibration(elevation_aperture_rad=aperture_rad), plain)
-    landmarks = LandmarkSightings(smoother, maker)
+    landmarks = LandmarkSightings(smoother, maker, DetectionJournal())
     smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
-    smoother.add([pose_prior(X(0), gtsam.Pose3(), 1e-4)])
+    smoother.add({"prior": pose_prior(X(0), gtsam.Pose3(), 1e-4)})
     smoother.update(0.0)
     sighting = Sighting(0, 0, Sightline(X(0), gtsam.Pose3(), np.array([range_m, 0.0])), NOISE, None)
     landmarks.exchange([], [(sighting, 7)], 0.0)
@@ -230,14 +230,14 @@ def nearest(
 ) -> tuple[int, int] | None:
     """Of landmarks at points with a joint covariance, each seen in some frames; rooted ones also before the window."""
     smoother = smoother_with(1e9, 0.1, 1e9)
-    landmarks = LandmarkSightings(smoother, SightingFactors(SonarCalibration(), plain))
+    landmarks = LandmarkSightings(smoother, SightingFactors(SonarCalibration(), plain), DetectionJournal())
     values = gtsam.Values()
     for (i, point), range_m in zip(points.items(), ranges_m, strict=True):
         values.insert(L(i), np.array(point))
         for stamp_ns in frames[i]:
             noise = np.diag([NOISE_M**2, (NOISE_M / 2) ** 2])
             sighting = Sighting(stamp_ns, 0, Sightline(X(0), gtsam.Pose3(), np.array([range_m, 0.0])), noise, None)
-            landmarks.enter(sighting, i, [])
+            landmarks._enter(sighting, i, None)
         if i in rooted:
             landmarks._rooted[i] = sighting
     joint = JointCovariance(cov, {L(i): 3 * k for k, i in enumerate(points)})

@@ -27,7 +27,7 @@ from gtsam.symbol_shorthand import L
 from sonar_graph.measurements import Floats
 from sonar_graph.slam.landmarks.mixture import Choices, Mixture, TrackedObject, supporters_elsewhere
 from sonar_graph.slam.landmarks.sighting import Sighting, SightingFactors
-from sonar_graph.slam.smoother import Sightlines, marginals_of, solve, solve_in_sight
+from sonar_graph.slam.smoother import marginals_of, solve, solve_in_sight
 
 LEAST_WEIGHT = 1e-6
 """Least weight of an object: variables that only its sightings hold stay determinate."""
@@ -44,11 +44,14 @@ class WeighedHistory:
     ) -> None:
         self._unweighed = gtsam.NonlinearFactorGraph(rest)
         for landmark_id, first in earliest(watches, ids).items():
-            for factor in maker.beginning(first, L(landmark_id)):
+            for factor in maker.beginning(first, L(landmark_id)).values():
                 self._unweighed.push_back(factor)
         self._maker = maker
         self._watches = [
-            [(sighting, L(landmark_id), maker.measured(sighting, L(landmark_id))) for sighting in watch.sightings]
+            [
+                (sighting, L(landmark_id), list(maker.measured(sighting, L(landmark_id)).values()))
+                for sighting in watch.sightings
+            ]
             for watch, landmark_id in zip(watches, ids, strict=True)
         ]
 
@@ -66,7 +69,7 @@ class WeighedHistory:
     ) -> list[gtsam.NoiseModelFactor]:
         weight = max(weight, LEAST_WEIGHT)
         if any(isinstance(factor, gtsam.CustomFactor) for factor in factors):  # of those GTSAM makes no copies
-            return self._maker.measured(replace(sighting, noise=sighting.noise / weight), key)
+            return list(self._maker.measured(replace(sighting, noise=sighting.noise / weight), key).values())
         divisor, diagonal = math.sqrt(weight), gtsam.noiseModel.Diagonal.Sigmas
         return [f.cloneWithNewNoiseModel(diagonal(f.noiseModel().sigmas() / divisor)) for f in factors]
 
@@ -152,7 +155,7 @@ class RivalHistory:
         said_once = sum(
             factor.error(values)
             for landmark_id, first in earliest([w for w, _ in chosen], [i for _, i in chosen]).items()
-            for factor in self._maker.beginning(first, L(landmark_id))
+            for factor in self._maker.beginning(first, L(landmark_id)).values()
         )
         components = sum(score[choice] for score, choice in zip(scores, choices, strict=True))
         return float(self._rest.error(values)) + said_once - components
@@ -209,11 +212,11 @@ class RivalHistory:
         return moved, choices
 
     def _solve(self, values: gtsam.Values, choices: Choices) -> gtsam.Values:
-        lines, start = Sightlines(), gtsam.Values(values)
+        lines, start = defaultdict(list), gtsam.Values(values)
         for watch, choice in zip(self._watches, choices, strict=True):
             if choice is not None:
                 for sighting in watch.sightings:
-                    lines.add(L(choice), sighting.line)
+                    lines[L(choice)].append(sighting.line)
                 if not start.exists(L(choice)):
                     start.insert(L(choice), self._maker.place(watch.sightings[0], values))
         return solve_in_sight(self._chosen_graph(choices), start, lines)
@@ -228,6 +231,6 @@ class RivalHistory:
         for landmark_id, sightings in of.items():
             sightings.sort(key=lambda sighting: (sighting.stamp_ns, sighting.row))
             for k, sighting in enumerate(sightings):
-                for factor in self._maker.make(sighting, L(landmark_id), is_first=k == 0):
+                for factor in self._maker.make(sighting, L(landmark_id), is_first=k == 0).values():
                     graph.push_back(factor)
         return graph

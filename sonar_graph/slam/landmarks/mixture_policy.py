@@ -157,7 +157,7 @@ class DoubtfulIdentities:
         """Choose anew in the window until nothing changes; move landmarks to where their sightings agree."""
         watches = self._open()
         if self._changes(watches, self._smoother.values):
-            self._smoother.flush(time_s)
+            self._landmarks.follow(self._smoother.flush(time_s))
             self._smoother.settle(time_s)  # a step of a robust kernel may end far from where the choices are to be made
         for _ in range(MOST_ROUNDS):
             changes = [
@@ -188,7 +188,7 @@ class DoubtfulIdentities:
                 if watch.landmark_id is not None or all(s.outcome is not Outcome.WITHHELD for s in watch.sightings)
             ]
             present = [watch.landmark_id for watch in watches]
-            handles = {handle for watch in watches for s in watch.sightings for handle in s.handles}
+            handles = {s.handle for watch in watches for s in watch.sightings if s.handle is not None}
             rival = RivalHistory(self._smoother.graph_without(handles), watches, self._mixture, self._maker)
             found, choices = rival.settled(values, present, is_graduated=self._is_graduated)
             if found is not values:

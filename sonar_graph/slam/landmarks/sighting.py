@@ -28,7 +28,7 @@ from sonar_graph.slam.models import (
     range_azimuth_jacobians,
     wrap_angle,
 )
-from sonar_graph.slam.smoother import GraphEdit, Sightline, Smoother, Withheld
+from sonar_graph.slam.smoother import Changed, FactorGroup, Factors, Sightline, Smoother
 from sonar_graph.states import DetectionJournal, Outcome
 
 
@@ -48,8 +48,8 @@ class Sighting:
     """Elevation of its direction when a landmark begins with it."""
     landmark_id: int | None = None
     """Landmark of which it is a sighting, or None."""
-    handles: tuple[int, ...] = ()
-    """Handles of its factors."""
+    handle: int | None = None
+    """Handle of its factors in the smoother."""
     outcome: Outcome = Outcome.WAITING
     """Present outcome."""
 
@@ -69,22 +69,22 @@ class SightingFactors:
         plain._robust = lambda noise: noise
         return plain
 
-    def make(self, sighting: Sighting, key: int, *, is_first: bool) -> list[gtsam.NonlinearFactor]:
+    def make(self, sighting: Sighting, key: int, *, is_first: bool) -> Factors:
         """Range and azimuth; the first sighting of a landmark also says what is known of its height and direction."""
         elevation = None if sighting.floor or not is_first else self.elevation_sigma_rad
         made = self.measured(sighting, key, elevation)
-        return [*made, *(self._placed(sighting, key) if is_first else [])]
+        return {**made, **(self._placed(sighting, key) if is_first else {})}
 
     def measured(
         self, sighting: Sighting, key: int, elevation_sigma_rad: float | None = None
-    ) -> list[gtsam.NoiseModelFactor]:
+    ) -> dict[str, gtsam.NoiseModelFactor]:
         """Range and azimuth, and elevation where it has a sigma."""
         line = sighting.line
         return factors.landmark_sighting(
             line.pose_key, key, line.body_T_sonar, line.z, sighting.noise, self._robust, elevation_sigma_rad
         )
 
-    def beginning(self, sighting: Sighting, key: int) -> list[gtsam.NonlinearFactor]:
+    def beginning(self, sighting: Sighting, key: int) -> Factors:
         """Factors of a landmark's first sighting besides range and azimuth, with the same kernel."""
         line = sighting.line
         if sighting.floor:
@@ -92,16 +92,16 @@ class SightingFactors:
         elevation = factors.elevation(
             line.pose_key, key, line.body_T_sonar, float(line.z[1]), self.elevation_sigma_rad, self._robust
         )
-        return [elevation, *self._placed(sighting, key)]
+        return {"elevation": elevation, **self._placed(sighting, key)}
 
-    def _placed(self, sighting: Sighting, key: int) -> list[gtsam.NonlinearFactor]:
+    def _placed(self, sighting: Sighting, key: int) -> Factors:
         """Factors on the place and the floor of a landmark, added once."""
         line = sighting.line
         range_m, azimuth_rad = line.z.tolist()
         on_beam = locate(line.body_T_sonar, range_m, azimuth_rad, sighting.elevation_rad)
-        made = [factors.first_direction(line.pose_key, key, on_beam)]
+        made = {"first direction": factors.first_direction(line.pose_key, key, on_beam)}
         if sighting.floor:
-            made.append(factors.floor_prior(key, sighting.floor.z_m, sighting.floor.sigma_m))
+            made["floor prior"] = factors.floor_prior(key, sighting.floor.z_m, sighting.floor.sigma_m)
         return made
 
     def place(self, sighting: Sighting, values: gtsam.Values) -> Floats:
@@ -124,8 +124,8 @@ class SightingFactors:
 class LandmarkSightings:
     """Sightings that are in the graph, by landmark."""
 
-    def __init__(self, smoother: Smoother, maker: SightingFactors) -> None:
-        self.smoother, self.maker = smoother, maker
+    def __init__(self, smoother: Smoother, maker: SightingFactors, journal: DetectionJournal) -> None:
+        self.smoother, self.maker, self._journal = smoother, maker, journal
         self._of: dict[int, dict[Sighting, None]] = defaultdict(dict)
         self._rooted: dict[int, Sighting] = {}
 
@@ -157,44 +157,28 @@ class LandmarkSightings:
         """Stamps of the frames that show a landmark."""
         return {sighting.stamp_ns for sighting in self._of.get(landmark_id, {})}
 
-    def add(self, sighting: Sighting, landmark_id: int, *, is_first: bool) -> None:
+    def add(self, sighting: Sighting, landmark_id: int, *, is_first: bool, gain: float = 0.0) -> None:
         """Add a sighting with its factors at the next update."""
         made = self.maker.make(sighting, L(landmark_id), is_first=is_first)
-        self.enter(sighting, landmark_id, self.smoother.add(made))
+        handle = self.smoother.add(made, (L(landmark_id), sighting.line), gain=gain)
+        self._enter(sighting, landmark_id, handle)
 
-    def enter(self, sighting: Sighting, landmark_id: int, handles: Iterable[int]) -> None:
-        """Add a sighting whose factors the smoother has already."""
-        sighting.landmark_id, sighting.handles = landmark_id, tuple(handles)
-        self._of[landmark_id][sighting] = None
-        self.smoother.sightlines.add(L(landmark_id), sighting.line)
+    def follow(self, changed: Changed) -> None:
+        """Take out sightings that the smoother could not use, and let go of those from poses that left.
 
-    def leave(self, pose_keys: set[int]) -> None:
-        """Poses leave a bounded window: what was seen from them is part of the graph for good.
-
-        A landmark that was seen from one of them stays, whatever becomes of its other sightings, and none of those
-        becomes its first.
+        What was seen from poses that left a bounded window is part of the graph for good: its landmark stays, whatever
+        becomes of its other sightings, and none of those becomes its first.
         """
-        for landmark, sightings in self._of.items():
-            gone = [sighting for sighting in sightings if sighting.line.pose_key in pose_keys]
-            for sighting in gone:
-                self._rooted.setdefault(landmark, sighting)
-                del sightings[sighting]
-
-    def withhold(self, withheld: Withheld, journal: DetectionJournal) -> set[int]:
-        """The smoother cannot use some factors: their sightings leave the graph; handles of all factors of those."""
-        gone = [
-            sighting
-            for landmark, sightings in self._of.items()
-            for sighting in sightings
-            if L(landmark) in withheld.keys or not withheld.handles.isdisjoint(sighting.handles)
-        ]
-        handles = {handle for sighting in gone for handle in sighting.handles}
-        for sighting in gone:
+        for sighting in [s for sightings in self._of.values() for s in sightings if s.handle in changed.withheld]:
             self._take(sighting)
             sighting.outcome = Outcome.WITHHELD
             if sighting.row >= 0:
-                journal.amend(sighting.row, Outcome.WITHHELD)
-        return handles
+                self._journal.amend(sighting.row, Outcome.WITHHELD)
+        for landmark, sightings in self._of.items() if changed.left else ():
+            gone = [sighting for sighting in sightings if sighting.line.pose_key in changed.left]
+            for sighting in gone:
+                self._rooted.setdefault(landmark, sighting)
+                del sightings[sighting]
 
     def exchange(self, leaving: Iterable[Sighting], coming: Iterable[tuple[Sighting, int]], time_s: float) -> None:
         """Take sightings out of the graph, and put others in, each for a landmark, in one update of the smoother.
@@ -202,15 +186,15 @@ class LandmarkSightings:
         Where the earliest sighting of a landmark changes, the factors of the old and of the new one are made anew. A
         landmark that loses its last sighting leaves the graph.
         """
-        self.smoother.flush(time_s)  # it may solve the history, and has to know every landmark of a sightline then
+        self.follow(self.smoother.flush(time_s))
         out, new = [s for s in leaving if s.landmark_id is not None], list(coming)
         touched = {s.landmark_id for s in out if s.landmark_id is not None} | {landmark for _, landmark in new}
         before = {landmark: self._first(landmark) for landmark in touched}
-        removed = [handle for sighting in out for handle in sighting.handles]
+        removed = [sighting.handle for sighting in out]
         for sighting in out:
             self._take(sighting)
         for sighting, landmark in new:
-            self.enter(sighting, landmark, ())
+            self._enter(sighting, landmark, None)
         firsts = {landmark: self._first(landmark) for landmark in before}
         fresh = {sighting for sighting, _ in new}
         again = [  # they stay in, but no longer are, or now are, the first of their landmark
@@ -220,7 +204,7 @@ class LandmarkSightings:
             for s in (old, firsts[landmark])
             if s is not None and s.landmark_id == landmark and s not in fresh
         ]
-        removed += [handle for sighting in again for handle in sighting.handles]
+        removed += [sighting.handle for sighting in again]
         begun = {
             L(landmark): self.maker.place(first, self.smoother.values)
             for landmark, first in firsts.items()
@@ -229,16 +213,22 @@ class LandmarkSightings:
         lost = [L(landmark) for landmark, first in firsts.items() if first is None and before[landmark] is not None]
         sightings = [sighting for sighting, _ in new] + again
         made = [
-            self.maker.make(s, L(s.landmark_id), is_first=s is firsts[s.landmark_id])
+            FactorGroup(
+                self.maker.make(s, L(s.landmark_id), is_first=s is firsts[s.landmark_id]), (L(s.landmark_id), s.line)
+            )
             for s in sightings
             if s.landmark_id is not None
         ]
+        changed = self.smoother.exchange(
+            time_s, [handle for handle in removed if handle is not None], made, begun, lost
+        )
+        for sighting, handle in zip(sightings, changed.added, strict=True):
+            sighting.handle = handle
+        self.follow(changed)
 
-        def entered(groups: list[list[int]]) -> None:
-            for sighting, handles in zip(sightings, groups, strict=True):
-                sighting.handles = tuple(handles)
-
-        self.smoother.exchange(GraphEdit(removed, made, begun, lost), time_s, entered)
+    def _enter(self, sighting: Sighting, landmark_id: int, handle: int | None) -> None:
+        sighting.landmark_id, sighting.handle = landmark_id, handle
+        self._of[landmark_id][sighting] = None
 
     def _first(self, landmark_id: int) -> Sighting | None:
         if landmark_id in self._rooted:
@@ -252,8 +242,7 @@ class LandmarkSightings:
         del self._of[landmark][sighting]
         if not self._of[landmark] and landmark not in self._rooted:
             del self._of[landmark]
-        self.smoother.sightlines.remove(L(landmark), sighting.line)
-        sighting.landmark_id, sighting.handles = None, ()
+        sighting.landmark_id = sighting.handle = None
 
 
 def source(sighting: Sighting, values: gtsam.Values, maker: SightingFactors) -> Source:

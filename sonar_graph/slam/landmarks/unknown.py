@@ -208,8 +208,8 @@ class AnonymousLandmarks:
         """Add sightings that were paired with landmarks; the others wait until their candidate becomes a landmark."""
         for sighting, (landmark_id, candidate, _, S) in zip(sightings, paired, strict=True):
             if landmark_id is not None and S is not None:
-                self._smoother.waiting_gain += float((np.diag(S) / np.diag(sighting.noise)).max()) - 1.0
-                self._landmarks.add(sighting, landmark_id, is_first=False)
+                gain = float((np.diag(S) / np.diag(sighting.noise)).max()) - 1.0
+                self._landmarks.add(sighting, landmark_id, is_first=False, gain=gain)
                 sighting.outcome = Outcome.USED
                 continue
             if candidate is None:

@@ -197,8 +197,8 @@ def landmark_sighting(
     cov: Floats,
     robust: Robust,
     elevation_sigma_rad: float | None = None,
-) -> list[gtsam.NoiseModelFactor]:
-    """Range and azimuth of a landmark.
+) -> dict[str, gtsam.NoiseModelFactor]:
+    """Range and azimuth of a landmark, by their labels in messages.
 
     Parameters
     ----------
@@ -211,18 +211,18 @@ def landmark_sighting(
         frames as noise would, so that repeating it would invent information.
     """
     range_var, azimuth_var, covariance = float(cov[0, 0]), float(cov[1, 1]), float(cov[0, 1])
-    factors: list[gtsam.NoiseModelFactor] = [
-        _camera(pose_key, landmark_key, body_T_sonar, float(z[1]), math.sqrt(azimuth_var), elevation_sigma_rad, robust)
-    ]
+    keys = pose_key, landmark_key
     if abs(covariance) < CORRELATION_LIMIT * math.sqrt(range_var * azimuth_var):
         noise = robust(gtsam.noiseModel.Isotropic.Sigma(1, math.sqrt(range_var)))
-        return [*factors, gtsam.RangeFactorWithTransform3D(pose_key, landmark_key, float(z[0]), noise, body_T_sonar)]
-    elevation_only = (
-        [elevation(pose_key, landmark_key, body_T_sonar, float(z[1]), elevation_sigma_rad, robust)]
-        if elevation_sigma_rad
-        else []
-    )
-    return [*elevation_only, correlated_sighting(pose_key, landmark_key, body_T_sonar, z, cov, robust)]
+        azimuth_sigma_rad = math.sqrt(azimuth_var)
+        return {
+            "azimuth": _camera(*keys, body_T_sonar, float(z[1]), azimuth_sigma_rad, elevation_sigma_rad, robust),
+            "range": gtsam.RangeFactorWithTransform3D(*keys, float(z[0]), noise, body_T_sonar),
+        }
+    both = {"range and azimuth": correlated_sighting(*keys, body_T_sonar, z, cov, robust)}
+    if not elevation_sigma_rad:
+        return both
+    return {"elevation": elevation(*keys, body_T_sonar, float(z[1]), elevation_sigma_rad, robust), **both}
 
 
 def elevation(
@@ -311,9 +311,9 @@ def gravity_direction(pose_key: int, up_in_body: Floats, sigma_rad: float) -> gt
     return gtsam.MagPoseFactorPose3(pose_key, measured, 1.0, UP, ORIGIN, noise)
 
 
-def planar(pose_key: int, motion: PlanarMotion) -> list[gtsam.NonlinearFactor]:
-    """The keyframe is level and at the plane's height."""
-    return [
-        gravity_direction(pose_key, UP, motion.tilt_sigma_rad),
-        depth(pose_key, motion.z_m, np.zeros(3), motion.z_sigma_m),
-    ]
+def planar(pose_key: int, motion: PlanarMotion) -> dict[str, gtsam.NonlinearFactor]:
+    """The keyframe is level and at the plane's height; factors by their labels in messages."""
+    return {
+        "level": gravity_direction(pose_key, UP, motion.tilt_sigma_rad),
+        "height": depth(pose_key, motion.z_m, np.zeros(3), motion.z_sigma_m),
+    }

@@ -10,8 +10,7 @@ sightings say where to start it instead (docs/theory/isam2.md).
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -132,53 +131,36 @@ class Sightline:
         return values.atPose3(self.pose_key).compose(self.body_T_sonar)
 
 
-class Sightlines:
-    """All sightings that have become factors, by landmark."""
+Sightlines = Mapping[int, Sequence[Sightline]]
+"""Sightings that have become factors, by landmark's key."""
 
-    def __init__(self) -> None:
-        self._lines: dict[int, dict[Sightline, None]] = defaultdict(dict)
 
-    def add(self, landmark_key: int, sightline: Sightline) -> None:
-        """A sighting of a landmark."""
-        self._lines[landmark_key][sightline] = None
+def turned_away(values: gtsam.Values, sightlines: Sightlines) -> list[int]:
+    """Landmarks that lie behind the sonar in at least half of their sightings."""
+    found = []
+    for key, lines in sightlines.items():
+        landmark = values.atPoint3(key)
+        if 2 * sum(line.is_behind(values, landmark) for line in lines) >= len(lines):
+            found.append(key)
+    return found
 
-    def remove(self, landmark_key: int, sightline: Sightline) -> None:
-        """A sighting that is no longer one of this landmark."""
-        del self._lines[landmark_key][sightline]
-        if not self._lines[landmark_key]:
-            del self._lines[landmark_key]
 
-    def leave(self, pose_keys: set[int]) -> None:
-        """Let go of sightings from some poses."""
-        for key in list(self._lines):
-            for line in [line for line in self._lines[key] if line.pose_key in pose_keys]:
-                self.remove(key, line)
-
-    def turned_away(self, values: gtsam.Values) -> list[int]:
-        """Landmarks that lie behind the sonar in at least half of their sightings."""
-        found = []
-        for key, lines in self._lines.items():
-            landmark = values.atPoint3(key)
-            if 2 * sum(line.is_behind(values, landmark) for line in lines) >= len(lines):
-                found.append(key)
-        return found
-
-    def placed_anew(self, values: gtsam.Values, landmark_keys: list[int]) -> gtsam.Values:
-        """The values, with each of the landmarks at the median of where its sightings, from these poses, say it is."""
-        placed = gtsam.Values(values)
-        for key in landmark_keys:
-            placed.update(key, np.median([line.point(values) for line in self._lines[key]], axis=0))
-        return placed
+def placed_anew(values: gtsam.Values, sightlines: Sightlines, landmark_keys: list[int]) -> gtsam.Values:
+    """The values, with each of the landmarks at the median of where its sightings, from these poses, say it is."""
+    placed = gtsam.Values(values)
+    for key in landmark_keys:
+        placed.update(key, np.median([line.point(values) for line in sightlines[key]], axis=0))
+    return placed
 
 
 def solve_in_sight(graph: gtsam.NonlinearFactorGraph, initial: gtsam.Values, sightlines: Sightlines) -> gtsam.Values:
     """Solve a graph; again while a landmark is stuck behind the sonar and its new start lowers the error."""
     values = solve(graph, initial)
     for _ in range(MAX_PLACEMENTS):
-        stuck = sightlines.turned_away(values)
+        stuck = turned_away(values, sightlines)
         if not stuck:
             break
-        retried = solve(graph, sightlines.placed_anew(values, stuck))
+        retried = solve(graph, placed_anew(values, sightlines, stuck))
         if graph.error(retried) >= graph.error(values):
             break
         values = retried

@@ -1,159 +1,102 @@
-"""Stores of a growing graph from which single factors can be taken out: the whole history, or the window's part."""
+"""Factors of the graph by handle, in groups that are used together or not at all, each factor with its label.
+
+One store serves window and history: groups are new until the window has taken them up. Of a bounded window a group
+leaves with the oldest pose of its factors, or bias where they have none: what it says is in marginals then.
+"""
 
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Container, Iterable, Iterator
 from dataclasses import dataclass
 
 import gtsam
 
-from sonar_graph.measurements import Floats
-from sonar_graph.slam.smoother.fixed_lag import without
+from sonar_graph.slam.smoother.batch_solution import Sightline, Sightlines
 
 POSE, LANDMARK = ord("x"), ord("l")
+Factors = dict[str, gtsam.NonlinearFactor]
+"""Factors by their labels in messages, such as "range"."""
 
 
-class History:
-    """Factors, each with a handle that stays the same while others come and go.
+@dataclass(frozen=True, eq=False, slots=True)
+class FactorGroup:
+    """Factors that are used together or not at all, such as those of one sighting."""
 
-    A place that becomes free is filled with the last factor, so that the graph has no holes, whatever is taken out.
-    """
+    factors: Factors
+    seen: tuple[int, Sightline] | None = None
+    """Of a sighting: the key of its landmark, and where that was seen from."""
+
+    def __iter__(self) -> Iterator[gtsam.NonlinearFactor]:
+        return iter(self.factors.values())
+
+
+class FactorStore:
+    """Groups of factors in the order in which they came, each with a handle that stays the same."""
 
     def __init__(self) -> None:
-        self.graph = gtsam.NonlinearFactorGraph()
-        """The factors that are in."""
-        self.changes = 0
-        """Number of factors ever put in or taken out."""
-        self._handles: list[int] = []
-        self._slots: dict[int, int] = {}
+        self.size = 0
+        """Number of factors."""
+        self.new: dict[int, FactorGroup] = {}
+        """Groups that the window has not taken up yet, by handle."""
+        self.gone: set[gtsam.NonlinearFactor] = set()
+        """Factors that were taken out since the window took up the others."""
+        self._groups: dict[int, FactorGroup] = {}
+        self._leaving_with: dict[int, list[int]] = defaultdict(list)
         self._next = 0
 
-    def add(self, factor: gtsam.NonlinearFactor) -> int:
-        """Put a factor in; its handle."""
+    def add(self, group: FactorGroup) -> int:
+        """Handle of a new group."""
         handle, self._next = self._next, self._next + 1
-        self._slots[handle] = len(self._handles)
-        self._handles.append(handle)
-        self.graph.add(factor)
-        self.changes += 1
+        self._groups[handle] = self.new[handle] = group
+        self.size += len(group.factors)
+        keys = {key for factor in group for key in list(factor.keys())}
+        poses = [key for key in keys if gtsam.symbolChr(key) == POSE]
+        if lasting := poses or [key for key in keys if gtsam.symbolChr(key) != LANDMARK]:
+            self._leaving_with[min(lasting)].append(handle)
         return handle
 
-    def factor(self, handle: int) -> gtsam.NonlinearFactor:
-        """The factor of a handle."""
-        return self.graph.at(self._slots[handle])
-
     def remove(self, handles: Iterable[int]) -> None:
-        """Take factors out."""
+        """Take groups out."""
         for handle in handles:
-            slot, last = self._slots.pop(handle), self._handles.pop()
-            if last != handle:
-                self.graph.replace(slot, self.graph.at(len(self._handles)))
-                self._handles[slot] = last
-                self._slots[last] = slot
-            self.graph.resize(len(self._handles))
-            self.changes += 1
+            self.new.pop(handle, None)
+            group = self._groups.pop(handle)
+            self.gone.update(group)
+            self.size -= len(group.factors)
 
-    def keep(self, window: gtsam.NonlinearFactorGraph, theta: gtsam.Values, left: Iterable[int]) -> None:
-        """Keep everything: a factor that leaves the window stays here."""
-
-
-class Recent:
-    """Factors of the window; those on variables that have left are in marginals for good, and their handles end."""
-
-    def __init__(self) -> None:
-        self.changes = 0
-        """Number of factors ever put in or taken out, and of times that variables left."""
-        self._factors: dict[int, gtsam.NonlinearFactor] = {}
-        self._handles: dict[int, list[int]] = defaultdict(list)
-        self._window, self._theta = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        self._waiting: list[int] = []
-        self._gone: list[gtsam.NonlinearFactor] = []
-        self._next = 0
-
-    @property
-    def graph(self) -> gtsam.NonlinearFactorGraph:
-        """Factors in the window, marginals among them, and those that wait to be."""
-        graph = without(self._window, self._theta, self._gone)
-        for handle in self._waiting:
-            graph.push_back(self._factors[handle])
-        return graph
-
-    def add(self, factor: gtsam.NonlinearFactor) -> int:
-        """Put a factor in; its handle."""
-        handle, self._next = self._next, self._next + 1
-        self._factors[handle] = factor
-        keys = [(key, gtsam.symbolChr(key)) for key in list(factor.keys())]
-        poses = [key for key, kind in keys if kind == POSE]
-        for key in poses or [key for key, kind in keys if kind != LANDMARK]:  # it leaves with its poses, else biases
-            self._handles[key].append(handle)
-        self._waiting.append(handle)
-        self.changes += 1
-        return handle
-
-    def factor(self, handle: int) -> gtsam.NonlinearFactor:
-        """The factor of a handle."""
-        return self._factors[handle]
-
-    def remove(self, handles: Iterable[int]) -> None:
-        """Take factors out."""
-        gone = [self._factors.pop(handle) for handle in handles]
-        self._gone += gone
-        self._waiting = [handle for handle in self._waiting if handle in self._factors]
-        self.changes += len(gone)
-
-    def keep(self, window: gtsam.NonlinearFactorGraph, theta: gtsam.Values, left: Iterable[int]) -> None:
-        """Take over the factors of an updated window, linearised at theta, and drop those of variables that left."""
-        self._window, self._theta, self._waiting, self._gone = window, theta, [], []
-        for key in left:
-            for handle in self._handles.pop(key, ()):
-                self._factors.pop(handle, None)
-            self.changes += 1
-
-
-@dataclass(frozen=True, eq=False)
-class GraphEdit:
-    """Exchange of factors for others."""
-
-    removed: list[int]
-    """Handles of factors that go."""
-    added: list[list[gtsam.NonlinearFactor]]
-    """Factors that come, in groups."""
-    new_landmarks: dict[int, Floats]
-    """Keys and first estimates of new landmarks."""
-    lost_landmarks: list[int]
-    """Keys of landmarks on which no factor is left."""
-
-
-class Pending:
-    """New factors with their handles, and new variables with their first estimates."""
-
-    def __init__(self) -> None:
-        self.graph = gtsam.NonlinearFactorGraph()
-        self.handles: list[int] = []
-        """Of the factors, in their order."""
-        self.values = gtsam.Values()
-        self.times_s: dict[int, float] = {}
-        """Of new poses."""
-
-    @property
-    def factors(self) -> list[gtsam.NonlinearFactor]:
-        """All of them."""
-        return [self.graph.at(i) for i in range(len(self.handles))]
-
-    def add(self, factor: gtsam.NonlinearFactor, handle: int) -> None:
-        """A new factor."""
-        self.graph.add(factor)
-        self.handles.append(handle)
-
-    def on(self, key: int) -> dict[int, gtsam.NonlinearFactor]:
-        """The factors on a variable, by handle."""
-        pairs = zip(self.handles, self.factors, strict=True)
-        return {handle: factor for handle, factor in pairs if key in list(factor.keys())}
-
-    def drop(self, handles: set[int], keys: set[int]) -> None:
-        """Take factors and variables out again."""
-        kept = [(handle, self.graph.at(i)) for i, handle in enumerate(self.handles) if handle not in handles]
-        self.graph, self.handles = gtsam.NonlinearFactorGraph(), []
-        for handle, factor in kept:
-            self.add(factor, handle)
+    def leave(self, keys: Iterable[int]) -> None:
+        """Give up the groups that leave with these variables."""
         for key in keys:
-            if self.values.exists(key):
-                self.values.erase(key)
+            for handle in self._leaving_with.pop(key, ()):
+                if group := self._groups.pop(handle, None):
+                    self.size -= len(group.factors)
+
+    def take_up(self) -> None:
+        """The window has taken up what was new, and let go of what is gone."""
+        self.new, self.gone = {}, set()
+
+    def factors(self, handles: Iterable[int]) -> list[gtsam.NonlinearFactor]:
+        """Factors of some groups."""
+        return [factor for handle in handles for factor in self._groups[handle]]
+
+    def graph(self, left_out: Container[int] = ()) -> gtsam.NonlinearFactorGraph:
+        """All factors but those of some handles."""
+        return graph_of(group for handle, group in self._groups.items() if handle not in left_out)
+
+    def __iter__(self) -> Iterator[FactorGroup]:
+        return iter(self._groups.values())
+
+    def sightlines(self) -> Sightlines:
+        """All sightings, by landmark's key."""
+        lines: dict[int, list[Sightline]] = defaultdict(list)
+        for group in self:
+            if group.seen is not None:
+                lines[group.seen[0]].append(group.seen[1])
+        return lines
+
+
+def graph_of(groups: Iterable[FactorGroup]) -> gtsam.NonlinearFactorGraph:
+    """Graph of the factors of some groups, in their order."""
+    graph = gtsam.NonlinearFactorGraph()
+    for group in groups:
+        for factor in group:
+            graph.push_back(factor)
+    return graph

@@ -5,7 +5,7 @@ sigma given its neighbours, which millimetre odometry reaches after some metres 
 once Cholesky has given up the window stays with QR (docs/theory/isam2.md).
 """
 
-from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from typing import Any
 
 import gtsam
@@ -36,54 +36,27 @@ def marginal(
     return [gtsam.LinearContainerFactor(found.at(i), values) for i in range(found.size())]
 
 
-def _copy(source: gtsam.Values, key: int, target: gtsam.Values) -> None:
-    """One variable, a pose or a point, from some values to others."""
-    if gtsam.symbolChr(key) == ord("x"):
-        target.insert(key, source.atPose3(key))
-    else:
-        target.insert(key, source.atPoint3(key))
-
-
-def anchored(factor: gtsam.NonlinearFactor, theta: gtsam.Values) -> gtsam.NonlinearFactor:
-    """A factor of a window by itself.
+def with_marginals(
+    window: gtsam.NonlinearFactorGraph, theta: gtsam.Values, left_out: Container[gtsam.NonlinearFactor]
+) -> gtsam.NonlinearFactorGraph:
+    """Marginals of a window linearised at theta, and its other factors but those left out.
 
     iSAM2 keeps a marginal without the values at which it holds: those at which the window's variables are linearised.
     """
-    if isinstance(factor, gtsam.LinearContainerFactor):
-        return gtsam.LinearContainerFactor(factor.linearize(theta), theta)
-    return factor
-
-
-def without(
-    graph: gtsam.NonlinearFactorGraph, theta: gtsam.Values, left_out: Iterable[gtsam.NonlinearFactor] = ()
-) -> gtsam.NonlinearFactorGraph:
-    """Graph of a window linearised at theta, its holes closed and its marginals anchored, less some factors."""
-    gone, kept = list(left_out), gtsam.NonlinearFactorGraph()
-    for i in range(graph.size()):
-        if graph.exists(i) and graph.at(i) not in gone:
-            kept.push_back(anchored(graph.at(i), theta))
-    return kept
-
-
-def joined(values: gtsam.Values, new: gtsam.Values) -> gtsam.Values:
-    """Values, with new ones where there are none yet."""
-    both = gtsam.Values(values)
-    for key in keys_of(new):
-        if not both.exists(key):
-            _copy(new, key, both)
-    return both
-
-
-def keys_of(values: gtsam.Values) -> list[int]:
-    """Keys of all variables."""
-    return list(values.keys())
+    graph = gtsam.NonlinearFactorGraph()
+    for factor in (window.at(i) for i in range(window.size()) if window.exists(i)):
+        if isinstance(factor, gtsam.LinearContainerFactor):
+            graph.push_back(gtsam.LinearContainerFactor(factor.linearize(theta), theta))
+        elif factor not in left_out:
+            graph.push_back(factor)
+    return graph
 
 
 def picked(values: gtsam.Values, keys: Iterable[int]) -> gtsam.Values:
-    """Some of the variables. GTSAM copies all that it is given for each factor in Python."""
+    """Some of the variables, poses and points. GTSAM copies all that it is given for each factor in Python."""
     few = gtsam.Values()
     for key in keys:
-        _copy(values, key, few)
+        few.insert(key, values.atPose3(key) if gtsam.symbolChr(key) == ord("x") else values.atPoint3(key))
     return few
 
 
@@ -109,43 +82,29 @@ class SmootherWindow:
         params.findUnusedFactorSlots = True
         return gtsam.IncrementalFixedLagSmoother(self.lag_s, params)
 
-    def begin(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, times_s: Mapping[Any, float]) -> None:
-        """Begin anew with nothing but these factors and variables; by QR where it is needed, else a RuntimeError."""
-        self._begin(lambda: graph, values, times_s)
-
-    def begin_after(
+    def begin(
         self,
-        outside: gtsam.NonlinearFactorGraph,
-        solved: gtsam.Values,
         inside: gtsam.NonlinearFactorGraph,
         values: gtsam.Values,
         times_s: Mapping[Any, float],
+        outside: tuple[gtsam.NonlinearFactorGraph, gtsam.Values] | None = None,
     ) -> None:
-        """Begin anew with the marginal of what lies outside, linearised at the solved values: by Cholesky, else by QR.
+        """Begin anew with nothing but these factors and variables, by Cholesky, else by QR.
 
-        A RuntimeError where even QR finds no solution.
+        With factors outside, and values of their variables, their marginal counts too. QR makes it anew, since by
+        Cholesky it may also have lost what is weak without a word. A RuntimeError where even QR finds no solution.
         """
-
-        def joined_with_marginal() -> gtsam.NonlinearFactorGraph:
-            """By QR made anew: a marginal by Cholesky may also have lost what is weak without a word."""
-            graph = gtsam.NonlinearFactorGraph(inside)
-            for factor in marginal(outside, solved, times_s, is_by_qr=self.is_by_qr):
-                graph.push_back(factor)
-            return graph
-
-        self._begin(joined_with_marginal, values, times_s)
-
-    def _begin(
-        self, make: Callable[[], gtsam.NonlinearFactorGraph], values: gtsam.Values, times_s: Mapping[Any, float]
-    ) -> None:
         try:
-            graph, self.isam = make(), self._empty()
+            graph = gtsam.NonlinearFactorGraph(inside)
+            for factor in marginal(*outside, times_s, is_by_qr=self.is_by_qr) if outside else ():
+                graph.push_back(factor)
+            self.isam = self._empty()
             self.isam.update(graph, values, times_s)
         except RuntimeError:
             if self.is_by_qr:
                 raise
             self.is_by_qr = True
-            self._begin(make, values, times_s)
+            self.begin(inside, values, times_s, outside)
 
     def update(
         self,
@@ -153,10 +112,11 @@ class SmootherWindow:
         values: gtsam.Values,
         times_s: Mapping[Any, float],
         removed_slots: Sequence[int],
-    ) -> None:
-        """With new factors and variables, without what is in some places."""
+    ) -> gtsam.Values:
+        """Estimate with new factors and variables, without what is in some places."""
         self.isam.setSmootherLag(self.lag_s)
         self.isam.update(graph, values, times_s, list(removed_slots))
+        return self.isam.calculateEstimate()
 
     def settle(self) -> None:
         """Update until nothing would be relinearised any more."""

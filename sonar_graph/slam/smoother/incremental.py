@@ -14,8 +14,8 @@ of what has left; a new window then begins from those, with the older linearisat
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
-from typing import Annotated, Any, Literal
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Annotated, Any, Literal, NamedTuple, Protocol
 
 import gtsam
 import numpy as np
@@ -27,13 +27,13 @@ from sonar_graph.measurements import Floats
 from sonar_graph.slam.smoother.batch_solution import (
     JointCovariance,
     KeptCovariance,
-    Sightlines,
+    Sightline,
     marginals_of,
     solve_in_sight,
 )
-from sonar_graph.slam.smoother.factor_store import GraphEdit, History, Pending, Recent
-from sonar_graph.slam.smoother.fixed_lag import SmootherWindow, joined, keys_of, picked, split, without
-from sonar_graph.slam.smoother.observability import Withheld, culprits, reasons, spoilt, undetermined, variable_name
+from sonar_graph.slam.smoother.factor_store import FactorGroup, Factors, FactorStore, graph_of
+from sonar_graph.slam.smoother.fixed_lag import SmootherWindow, picked, split, with_marginals
+from sonar_graph.slam.smoother.observability import Blame, Withheld, variable_name
 
 RESTART_GROWTH = 1.25
 """Number of factors, relative to that at the last restart, before the next one."""
@@ -81,149 +81,179 @@ class BoundedHistory(Section):
 HistoryParams = Annotated[WholeHistory | BoundedHistory, *tagged("policy", "whole")]
 
 
+class Departures(Protocol):
+    """Takes note of variables before they leave a bounded window for good."""
+
+    def leave(self, keys: set[int], values: gtsam.Values, marginals: gtsam.ISAM2) -> None:
+        """Variables that leave, with all estimates and covariances of the window, as long as they are in it."""
+        ...
+
+
+class Changed(NamedTuple):
+    """Changes of the graph by an update or an exchange."""
+
+    added: list[int]
+    """Handles of groups that an exchange put in."""
+    withheld: set[int]
+    """Handles of groups that could not be used and are out again."""
+    left: set[int]
+    """Keys of variables that left a bounded window."""
+
+
 class Smoother:
     """Growing graph with a bounded incremental solution; plain iSAM2 over the whole history where the lag is infinite.
 
-    When bounded, factors that leave the window become marginals for good, and their variables are forgotten.
+    Parameters
+    ----------
+    departures
+        Makes the history bounded: factors that leave the window become marginals for good, and their variables, of
+        which this takes note, are forgotten. None: the whole history is kept.
     """
 
-    def __init__(self, params: SmootherParams, *, is_bounded: bool = False) -> None:
+    def __init__(self, params: SmootherParams, departures: Departures | None = None) -> None:
         self.params = params
-        self._restart_size = FIRST_RESTART
-        self.is_bounded = is_bounded
-        self._history: History | Recent = Recent() if is_bounded else History()
-        self._restarted_s = self._newest_s = -np.inf
-        self.withheld: deque[str] = deque(maxlen=MOST_MESSAGES)
-        """The newest of what was withheld, and why."""
-        self.when_leaving: Callable[[set[int]], None] = lambda _: None
-        """Called with the keys of variables before they leave a bounded window, while they are still in it."""
         self.values = gtsam.Values()
         """The newest estimate of every variable; of those that left the window, the last one there."""
-        self.sightlines = Sightlines()
-        """Where each landmark was seen from."""
-        self.waiting_gain = 0.0
-        """Expected gain of the factors added since the last update: sum of predicted variances over noise variances."""
-        self.when_withheld: Callable[[Withheld], set[int]] = lambda _: set()
-        """Called when new factors cannot be used; returns the handles of others that are nothing without them."""
-        self._pending = Pending()
+        self.withheld: deque[str] = deque(maxlen=MOST_MESSAGES)
+        """The newest of what was withheld, and why."""
+        self._departures = departures
+        self._store = FactorStore()
+        self._new_values = gtsam.Values()
+        self._new_times_s: dict[int, float] = {}
+        self._waiting_gain = 0.0
+        self._refused: set[int] = set()
+        self._left: set[int] = set()
+        self._restart_size = FIRST_RESTART
+        self._restarted_s = self._newest_s = -np.inf
         self._expiring: dict[int, float] = {}
         self._held: dict[int, float] = {}
         self._landmarks: list[int] = []
         self._bias: list[int] = []
         self._window = SmootherWindow(params.relinearize_threshold, params.lag_s)
+        self._taken_up = gtsam.NonlinearFactorGraph(), gtsam.Values()
         self._kept_covariance = KeptCovariance()
         self._solved: tuple[gtsam.Values, gtsam.Marginals | gtsam.ISAM2] | None = None
-        self._solved_changes = 0
+
+    @property
+    def is_bounded(self) -> bool:
+        """True when what leaves the window is given up."""
+        return self._departures is not None
 
     @property
     def graph(self) -> gtsam.NonlinearFactorGraph:
         """Every factor of the run; of a bounded one those of the window, marginals among them."""
-        return self._history.graph
+        if not self.is_bounded:
+            return self._store.graph()
+        graph = with_marginals(*self._taken_up, self._store.gone)
+        graph.push_back(graph_of(self._store.new.values()))
+        return graph
+
+    def graph_without(self, handles: set[int]) -> gtsam.NonlinearFactorGraph:
+        """Every factor of the run, of which the whole history is kept, but those of some handles."""
+        return self._store.graph(left_out=handles)
 
     def add_pose(self, key: int, pose: gtsam.Pose3, time_s: float) -> None:
         """Add a keyframe with its first estimate; an `EstimatorError` where the key is taken or time runs back."""
-        self._check_new(key)
         if time_s < self._newest_s:
             raise EstimatorError(
                 f"isam2: {variable_name(key)} at {time_s:.3f} s is older than the one before ({self._newest_s:.3f} s);"
                 " give keyframes in the order of time"
             )
-        self._newest_s = time_s
         self._insert(key, pose)
-        self._pending.times_s[key] = time_s
-        self._expiring[key] = time_s
+        self._newest_s = self._new_times_s[key] = self._expiring[key] = time_s
 
     def add_landmark(self, key: int, point: Floats) -> None:
         """Add a landmark, which never leaves the window, with its first estimate."""
-        self._check_new(key)
         self._insert(key, point)
         self._landmarks.append(key)
 
     def add_bias(self, key: int, bias: Floats) -> None:
         """Add a gyro bias with its first estimate. It stays in the window until the lag after the next one."""
-        self._check_new(key)
         self._insert(key, bias)
         self._bias = [key]
 
-    def _check_new(self, key: int) -> None:
-        if self.values.exists(key):
-            raise EstimatorError(f"isam2: {variable_name(key)} is in the graph already; give each its own key")
-
     def _insert(self, key: int, first: gtsam.Pose3 | Floats) -> None:
         """A first estimate, for the window and for who asks meanwhile."""
-        self._pending.values.insert(key, first)
+        if self.values.exists(key):
+            raise EstimatorError(f"isam2: {variable_name(key)} is in the graph already; give each its own key")
+        self._new_values.insert(key, first)
         self.values.insert(key, first)
 
-    def add(self, factors: Iterable[gtsam.NonlinearFactor]) -> list[int]:
-        """New factors, used at the next update; the handles by which they can be taken out."""
-        handles = []
-        for factor in factors:
-            handles.append(self._history.add(factor))
-            self._pending.add(factor, handles[-1])
-        return handles
+    def add(self, factors: Factors, seen: tuple[int, Sightline] | None = None, *, gain: float = 0.0) -> int:
+        """Add factors that are used together or not at all, at the next update; their handle.
+
+        Parameters
+        ----------
+        factors
+            By their labels in messages.
+        seen
+            Of a sighting: the key of its landmark, and where that was seen from.
+        gain
+            What they have to tell: predicted variance over noise variance.
+        """
+        self._waiting_gain += gain
+        self._solved = None
+        return self._store.add(FactorGroup(factors, seen))
 
     def hold(self, until_s: dict[int, float]) -> None:
         """Keep keyframes, and all later ones (iSAM2 marginalises in order), in the window until times; no others."""
         self._held = until_s
 
-    def flush(self, time_s: float) -> None:
+    @property
+    def is_due(self) -> bool:
+        """True when variables wait for an update, or factors that would change the estimate."""
+        return self._new_values.size() > 0 or self._waiting_gain > self.params.waiting_gain
+
+    def update(self, time_s: float) -> Changed:
+        """Bring the window's estimate up to date with what was added; what is older than the lag leaves it."""
+        if not self._withhold_unusable() or self.is_due:
+            self._update(time_s, self._lag_at(time_s))
+        return self._changed()
+
+    def flush(self, time_s: float) -> Changed:
         """Update with the factors that wait, if any; a bounded window keeps its variables."""
         self._withhold_unusable()
-        if self._pending.handles:
+        if self._store.new:
             self._update(time_s, self._exchange_lag_s(time_s))
+        return self._changed()
 
     def exchange(
-        self, what: GraphEdit, time_s: float, entered: Callable[[list[list[int]]], None] = lambda _: None
-    ) -> list[list[int]]:
-        """Take factors out, put others in, and update the window; the handles of each group put in.
+        self,
+        time_s: float,
+        removed: Sequence[int] = (),
+        added: Sequence[FactorGroup] = (),
+        new_landmarks: Mapping[int, Floats] | None = None,
+        lost_landmarks: Sequence[int] = (),
+    ) -> Changed:
+        """Take groups of factors out, put others in, and update the window.
 
-        ``entered`` gets these handles before anything is solved: `when_withheld` may be about one of them.
+        Parameters
+        ----------
+        removed
+            Handles of groups that go.
+        new_landmarks
+            Keys and first estimates.
+        lost_landmarks
+            Keys of those on which no factor is left.
         """
-        self.flush(time_s)
-        slots = self._window.slots([self._history.factor(handle) for handle in what.removed])
-        self._forget(what.lost_landmarks)
-        self._history.remove(what.removed)
-        for key, point in what.new_landmarks.items():
+        flushed = self.flush(time_s)
+        slots = self._window.slots(self._store.factors(removed))
+        self._forget(lost_landmarks)
+        self._store.remove(removed)
+        for key, point in (new_landmarks or {}).items():
             self.add_landmark(key, point)
-        handles = [self.add(group) for group in what.added]
-        entered(handles)
+        handles = [self.add(group.factors, group.seen) for group in added]
         self._withhold_unusable()
-        keys = self._pending.graph.keyVector()
+        keys = graph_of(self._store.new.values()).keyVector()
         self._window.lag_s = self._exchange_lag_s(time_s)
-        if slots is None or what.lost_landmarks or len(self.in_window(keys)) < len(keys):
-            self._clear_pending()
+        if slots is None or lost_landmarks or len(self.in_window(keys)) < len(keys):
+            self._kept_covariance.renew(self._landmarks)
             self._restart(time_s)
         else:
             self._update(time_s, self._window.lag_s, slots)
             self.settle(time_s)
-        return handles
-
-    def _exchange_lag_s(self, time_s: float) -> float:
-        """Nothing leaves a bounded window between what an exchange takes out and what it puts in."""
-        inside_s = [time_s - t + ROUNDING_S for t in self._expiring.values()] if self.is_bounded else []
-        return max([self._lag_at(time_s), *inside_s])
-
-    def in_window(self, keys: list[int]) -> list[int]:
-        """Keys of variables that are in the window, or about to be."""
-        inside = self._window.isam.getLinearizationPoint() if keys else gtsam.Values()
-        return [key for key in keys if inside.exists(key) or self._pending.values.exists(key)]
-
-    def _forget(self, landmark_keys: list[int]) -> None:
-        for key in landmark_keys:
-            self._landmarks.remove(key)
-            self.values.erase(key)
-
-    def graph_without(self, handles: set[int]) -> gtsam.NonlinearFactorGraph:
-        """Every factor of the run but those of some handles."""
-        gone, graph, rest = (
-            {self._history.factor(handle) for handle in handles},
-            self.graph,
-            gtsam.NonlinearFactorGraph(),
-        )
-        for i in range(graph.size()):
-            if graph.at(i) not in gone:
-                rest.push_back(graph.at(i))
-        return rest
+        changed = self._changed()
+        return Changed(handles, flushed.withheld | changed.withheld, flushed.left | changed.left)
 
     def settle(self, time_s: float) -> None:
         """Gauss-Newton steps until nothing would be relinearised any more, ten at most."""
@@ -234,37 +264,53 @@ class Smoother:
         self._kept_covariance.outdate()
         self._take(self._window.isam.calculateEstimate())
 
-    @property
-    def is_due(self) -> bool:
-        """True when variables wait for an update, or factors that would change the estimate."""
-        return self._pending.values.size() > 0 or self.waiting_gain > self.params.waiting_gain
+    def _changed(self) -> Changed:
+        """Changes since the last answer."""
+        changed = Changed([], self._refused, self._left)
+        self._refused, self._left = set(), set()
+        return changed
 
-    def update(self, time_s: float) -> None:
-        """Bring the window's estimate up to date with what was added; what is older than the lag leaves it."""
-        if not self._withhold_unusable() or self.is_due:
-            self._update(time_s, self._lag_at(time_s))
+    def _exchange_lag_s(self, time_s: float) -> float:
+        """Nothing leaves a bounded window between what an exchange takes out and what it puts in."""
+        inside_s = [time_s - t + ROUNDING_S for t in self._expiring.values()] if self.is_bounded else []
+        return max([self._lag_at(time_s), *inside_s])
+
+    def _lag_at(self, time_s: float) -> float:
+        """Age (s) from which on poses leave the window."""
+        held = (time_s - self._expiring[key] + ROUNDING_S for key, until_s in self._held.items() if time_s <= until_s)
+        return max([self.params.lag_s, *held])
+
+    def in_window(self, keys: list[int]) -> list[int]:
+        """Keys of variables that are in the window, or about to be."""
+        inside = self._window.isam.getLinearizationPoint() if keys else gtsam.Values()
+        return [key for key in keys if inside.exists(key) or self._new_values.exists(key)]
+
+    def _forget(self, landmark_keys: Iterable[int]) -> None:
+        for key in landmark_keys:
+            self._landmarks.remove(key)
+            self.values.erase(key)
 
     def _update(self, time_s: float, lag_s: float, removed_slots: Sequence[int] = ()) -> None:
-        """The same without what is in some places of the window."""
+        """Update the window, without what is in some places of it, and restart it where it is stale."""
         self._expiring |= dict.fromkeys(self._bias, time_s)
-        if self.is_bounded:
+        if self._departures is not None:
             old = (key for key, t in self._expiring.items() if t < time_s - lag_s)
-            if leaving := {key for key in old if not self._pending.values.exists(key)}:
-                self.when_leaving(leaving)
+            if leaving := {key for key in old if not self._new_values.exists(key)}:
+                self._departures.leave(leaving, self.values, self.marginals)
         self._window.lag_s = lag_s
-        times = self._times(self._pending.times_s, time_s)
+        graph, times = graph_of(self._store.new.values()), self._times(self._new_times_s, time_s)
         try:
-            self._window.update(self._pending.graph, self._pending.values, times, removed_slots)
-            estimate = self._window.isam.calculateEstimate()
+            estimate = self._window.update(graph, self._new_values, times, removed_slots)
         except RuntimeError:
             if not self._go_without(time_s):
                 self._give_up_cholesky(time_s)
                 return
             estimate = self._window.isam.calculateEstimate()
-        self._clear_pending()
+        self._kept_covariance.renew(self._landmarks)
+        self._clear_new()
         self._take(estimate)
         since_s = self._restarted_s + self.params.lag_s
-        may_restart = time_s >= since_s if self.is_bounded else self.graph.size() >= self._restart_size
+        may_restart = time_s >= since_s if self.is_bounded else self._store.size >= self._restart_size
         if may_restart and self._window.largest_shift(self._landmarks) > self.params.stale_shift_m:
             self._restart(time_s)
 
@@ -272,39 +318,51 @@ class Smoother:
         """When variables were last seen, from those of poses: landmarks and the newest bias are seen now."""
         return poses_s | dict.fromkeys(self._landmarks + self._bias, time_s)
 
+    def _blame(self) -> Blame:
+        return Blame(self._store, list(self._new_values.keys()), self._expiring)
+
     def _withhold_unusable(self) -> bool:
         """Take new factors out again that the window could not be solved with; whether there were any."""
-        values = picked(self.values, self._pending.graph.keyVector())
-        self._withhold(found := spoilt(self._pending, values, self._expiring))
-        self._withhold(more := undetermined(self._pending, values, self._expiring))
+        blame = self._blame()
+        values = picked(self.values, blame.graph.keyVector())
+        if found := blame.spoilt(values):
+            self._withhold(found)
+            blame = self._blame()
+        more = blame.undetermined(values)
+        self._withhold(more)
         return bool(found or more)
 
     def _withhold(self, found: list[Withheld]) -> None:
         for withheld in found:
-            handles = (withheld.handles | self.when_withheld(withheld)).intersection(self._pending.handles)
             self.withheld.append(withheld.message)
-            self._history.remove(handles)
-            self._pending.drop(handles, withheld.keys)
-            self._forget([key for key in withheld.keys if key in self._landmarks])
+            handles = withheld.handles.intersection(self._store.new)
+            self._refused |= handles
+            self._store.remove(handles)
+            for key in withheld.keys:
+                if self._new_values.exists(key):
+                    self._new_values.erase(key)
+            self._forget(key for key in withheld.keys if key in self._landmarks)
 
     def _go_without(self, time_s: float) -> bool:
         """Solve the window without those new factors that are to blame; whether there are any.
 
         The window is made anew of the same factors with the same linearisation: nothing else changes.
         """
-        theta = joined(self._window.isam.getLinearizationPoint(), self._pending.values)
-        before = without(self._window.isam.getFactors(), theta, self._pending.factors)
-        if not (found := culprits(before, self._pending, theta, self._expiring)):
+        theta = gtsam.Values(self._new_values)
+        theta.insert_or_assign(self._window.isam.getLinearizationPoint())
+        new = {factor for group in self._store.new.values() for factor in group}
+        before = with_marginals(self._window.isam.getFactors(), theta, new)
+        if not (found := self._blame().culprits(before, theta)):
             return False
         self._withhold(found)
         for key in set().union(*(withheld.keys for withheld in found)):
             theta.erase(key)
-        before.push_back(self._pending.graph)
-        kept_s = {key: self._expiring.get(key, time_s) for key in keys_of(theta)}
+        before.push_back(graph_of(self._store.new.values()))
+        kept_s = {key: self._expiring.get(key, time_s) for key in list(theta.keys())}
         try:
             self._window.begin(before, theta, self._times(kept_s, time_s))
         except RuntimeError as error:
-            raise EstimatorError(f"isam2: {reasons(before, theta, self._expiring)}") from error
+            raise EstimatorError(f"isam2: {self._blame().reasons(before, theta)}") from error
         return True
 
     def _take(self, estimate: gtsam.Values) -> None:
@@ -317,40 +375,35 @@ class Smoother:
         left = [key for key in self._expiring if not estimate.exists(key)]
         for key in left:
             del self._expiring[key]
-        self.sightlines.leave(set(left))
-        self._history.keep(self._window.isam.getFactors(), self._window.isam.getLinearizationPoint(), left)
+        self._left.update(left)
+        self._store.leave(left)
+        self._taken_up = self._window.isam.getFactors(), self._window.isam.getLinearizationPoint()
 
     def _give_up_cholesky(self, time_s: float) -> None:
         """Go on by QR after Cholesky met a pose far less certain than its step; `EstimatorError` where QR fails too."""
         self._window.is_by_qr = True
-        self._clear_pending()
+        self._kept_covariance.renew(self._landmarks)
         self._restart(time_s)
 
-    def _lag_at(self, time_s: float) -> float:
-        """Age (s) from which on poses leave the window."""
-        held = (time_s - self._expiring[key] + ROUNDING_S for key, until_s in self._held.items() if time_s <= until_s)
-        return max([self.params.lag_s, *held])
-
-    def _clear_pending(self) -> None:
-        self._pending = Pending()
-        self.waiting_gain = 0.0
-        self._kept_covariance.renew(self._landmarks)
+    def _clear_new(self) -> None:
+        """The window has taken up all that was new."""
+        self._store.take_up()
+        self._new_values, self._new_times_s, self._waiting_gain = gtsam.Values(), {}, 0.0
 
     def _restart(self, time_s: float) -> None:
         """Solve the history; start a window whose prior is the marginal of all that lies before it."""
-        self._restart_size, self._restarted_s = max(FIRST_RESTART, int(RESTART_GROWTH * self.graph.size())), time_s
-        self.values = self._solve()
+        graph = self.graph
+        self._clear_new()
+        self._restart_size, self._restarted_s = max(FIRST_RESTART, int(RESTART_GROWTH * graph.size())), time_s
+        self.values = solve_in_sight(graph, self.values, self._store.sightlines())
         kept_s = {key: t for key, t in self._expiring.items() if t >= time_s - self._window.lag_s}
         times: dict[Any, float] = kept_s | dict.fromkeys(self._landmarks, time_s)
-        inside, outside = split(self.graph, set(times))
+        inside, outside = split(graph, set(times))
         try:
-            self._window.begin_after(outside, self.values, inside, picked(self.values, times), times)
+            self._window.begin(inside, picked(self.values, times), times, (outside, self.values))
         except RuntimeError as error:
-            raise EstimatorError(f"isam2: {reasons(self.graph, self.values, self._expiring)}") from error
+            raise EstimatorError(f"isam2: {self._blame().reasons(graph, self.values)}") from error
         self._take(self._window.isam.calculateEstimate())
-
-    def _solve(self) -> gtsam.Values:
-        return solve_in_sight(self.graph, self.values, self.sightlines)
 
     @property
     def landmark_ids(self) -> list[int]:
@@ -381,7 +434,8 @@ class Smoother:
 
         Ask that for ``marginalCovariance(key)`` or ``jointMarginalCovariance(keys)``.
         """
-        if self._solved is None or self._solved_changes != self._history.changes:
-            values = self._solve()
-            self._solved, self._solved_changes = (values, marginals_of(self.graph, values)), self._history.changes
+        if self._solved is None:
+            graph = self.graph
+            values = solve_in_sight(graph, self.values, self._store.sightlines())
+            self._solved = values, marginals_of(graph, values)
         return self._solved

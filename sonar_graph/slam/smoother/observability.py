@@ -9,7 +9,7 @@ rest goes on without them. A keyframe cannot be withheld, since later ones hang 
 """
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
 import gtsam
@@ -18,9 +18,10 @@ import numpy as np
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats
 from sonar_graph.slam.smoother.batch_solution import tangent_size
-from sonar_graph.slam.smoother.factor_store import Pending
-from sonar_graph.slam.smoother.fixed_lag import keys_of
+from sonar_graph.slam.smoother.factor_store import FactorStore, graph_of
 
+Labelled = tuple[str, gtsam.NonlinearFactor]
+MARGINAL = "marginal of what left the window"
 LEAST_SAID = 2e-3
 """Standard deviations by metre or radian: the graph gives directions that it leaves to others sigmas of a thousand and
 more (`sonar_graph.slam.models.factors`)."""
@@ -32,19 +33,12 @@ AXES = {
     "l": ("x", "y", "z"),
     "b": ("about x", "about y", "about z"),
 }
-KINDS = {
-    "RangeFactorWithTransform3D": "range",
-    "RangeFactor3D": "range",
-    "GenericProjectionFactorCal3Fisheye": "azimuth",
-    "BearingRangeFactor3D": "first direction",
-    "PriorFactorPoint3": "prior",
-    "PriorFactorPose3": "prior",
-    "BetweenFactorPose3": "odometry",
-    "BetweenFactorPoint3": "bias walk",
-    "GPSFactorArm": "depth",
-    "MagPoseFactorPose3": "gravity",
-    "LinearContainerFactor": "marginal of what left the window",
+MISSING = {
+    "l": "an elevation, a floor prior or a view from elsewhere is missing",
+    "b": "a prior or a walk from another bias is missing",
+    "x": "odometry from another keyframe or a prior is missing",
 }
+SPOILT = "gives an error that is no number"
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,37 +105,15 @@ def _rows(factor: gtsam.NonlinearFactor, values: gtsam.Values, places: dict[int,
     return rows[np.linalg.norm(A, axis=1) >= least_said]
 
 
-def not_finite(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> list[int]:
-    """Places of the factors whose error or derivative is no number."""
-    found = []
-    for i in range(graph.size()):
-        A, b = graph.at(i).linearize(values).jacobian()
-        if not (np.isfinite(A).all() and np.isfinite(b).all()):
-            found.append(i)
-    return found
+def is_finite(factor: gtsam.NonlinearFactor, values: gtsam.Values) -> bool:
+    """True when error and derivative of a factor are numbers."""
+    return all(np.isfinite(part).all() for part in factor.linearize(values).jacobian())
 
 
 def variable_name(key: int) -> str:
     """Kind and number of a variable, in words."""
     kind = {"x": "keyframe", "l": "landmark", "b": "gyro bias"}.get(chr(gtsam.symbolChr(key)), "variable")
     return f"{kind} {gtsam.Symbol(key).index()}"
-
-
-def factor_names(factors: Iterable[gtsam.NonlinearFactor]) -> str:
-    """Number of factors of each kind, in words."""
-    counts: Counter[str] = Counter()
-    for factor in factors:
-        name, kinds = type(factor).__name__, [chr(gtsam.symbolChr(key)) for key in list(factor.keys())]
-        custom = "odometry" if kinds[:2] == ["x", "x"] else "range and azimuth"
-        counts[custom if name == "CustomFactor" else KINDS.get(name, name)] += 1
-    return ", ".join(f"{count} {kind}" for kind, count in counts.items()) or "no factor"
-
-
-MISSING = {
-    "l": "an elevation, a floor prior or a view from elsewhere is missing",
-    "b": "a prior or a walk from another bias is missing",
-    "x": "odometry from another keyframe or a prior is missing",
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,81 +126,98 @@ class Withheld:
     """The variable, its factors, and what is missing."""
 
 
-def spoilt(pending: Pending, values: gtsam.Values, times_s: dict[int, float]) -> list[Withheld]:
-    """New factors whose error is no number."""
-    if np.isfinite(pending.graph.error(values)):
-        return []
-    found = []
-    for i in not_finite(pending.graph, values):
-        handle, factor = pending.handles[i], pending.graph.at(i)
-        key = max(list(factor.keys()), key=lambda k: gtsam.symbolChr(k) == ord("l"))
-        told = f"{_placed(key, [factor], times_s)}: {factor_names([factor])} gives an error that is no number; withheld"
-        found.append(Withheld({handle}, set(), told))
-    return found
+class Blame:
+    """Finds which new factors keep a graph from a solution, and names them, or what it lacks, in messages.
 
-
-def undetermined(
-    pending: Pending, values: gtsam.Values, times_s: dict[int, float], least_said: float = 0.0
-) -> list[Withheld]:
-    """New landmarks and biases that their factors leave open, whatever becomes of the poses."""
-    found = []
-    for key in keys_of(pending.values):
-        if gtsam.symbolChr(key) != ord("x"):
-            found += [
-                _without(open_, pending, times_s) for open_ in left_open(pending.graph, values, [key], least_said)
-            ]
-    return found
-
-
-def culprits(
-    window: gtsam.NonlinearFactorGraph, pending: Pending, values: gtsam.Values, times_s: dict[int, float]
-) -> list[Withheld]:
-    """New factors because of which a window cannot be solved; none where it can, if with better arithmetic.
-
-    An `EstimatorError` where a keyframe, or what was in the window before, is left open.
+    Parameters
+    ----------
+    store
+        Factors with their labels.
+    new_keys
+        Variables that the window has not taken up yet.
+    times_s
+        Times of keyframes.
     """
-    graph = gtsam.NonlinearFactorGraph(window)
-    graph.push_back(pending.graph)
-    found: list[Withheld] = []
-    used = set(graph.keyVector()) | set(keys_of(pending.values))
-    for open_ in left_open(graph, values, sorted(used)):
-        if gtsam.symbolChr(open_.key) == ord("x") or not pending.values.exists(open_.key):
-            raise EstimatorError(f"isam2: {explained(open_, _on(open_.key, graph), times_s)}")
-        found.append(_without(open_, pending, times_s))
-    return found or undetermined(pending, values, times_s, LEAST_SAID)
 
+    def __init__(self, store: FactorStore, new_keys: Collection[int], times_s: Mapping[int, float]) -> None:
+        self._store, self._new_keys, self._times_s = store, new_keys, times_s
+        self.graph = graph_of(store.new.values())
+        """New factors."""
 
-def reasons(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, times_s: dict[int, float]) -> str:
-    """Reason, in words, why a graph has no solution."""
-    spoilt = [graph.at(i) for i in not_finite(graph, values)]
-    if spoilt:
-        where = _placed(list(spoilt[0].keys())[-1], spoilt, times_s)
-        return f"{where}: {factor_names(spoilt)} gives an error that is no number; leave the measurement out"
-    found = [explained(open_, _on(open_.key, graph), times_s) for open_ in left_open(graph, values, keys_of(values))]
-    return "; ".join(found) or "the graph is determined too weakly for arithmetic of sixteen digits; narrow its priors"
+    def spoilt(self, values: gtsam.Values) -> list[Withheld]:
+        """New factors whose error is no number."""
+        if np.isfinite(self.graph.error(values)):
+            return []
+        return [
+            Withheld({handle}, set(), f"{self._told([(label, factor)])} {SPOILT}; withheld")
+            for handle, group in self._store.new.items()
+            for label, factor in group.factors.items()
+            if not is_finite(factor, values)
+        ]
 
+    def undetermined(self, values: gtsam.Values, least_said: float = 0.0) -> list[Withheld]:
+        """New landmarks and biases that their factors leave open, whatever becomes of the poses."""
+        return [
+            self._without(open_)
+            for key in self._new_keys
+            if gtsam.symbolChr(key) != ord("x")
+            for open_ in left_open(self.graph, values, [key], least_said)
+        ]
 
-def explained(open_: Open, factors: list[gtsam.NonlinearFactor], times_s: dict[int, float]) -> str:
-    """Variable, its factors, the open directions, and what would close them, in words."""
-    kind = chr(gtsam.symbolChr(open_.key))
-    return f"{_placed(open_.key, factors, times_s)}: {factor_names(factors)}; open: {open_.axes()}; {MISSING[kind]}"
+    def culprits(self, window: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> list[Withheld]:
+        """New factors because of which a window cannot be solved; none where it can, if with better arithmetic.
 
+        An `EstimatorError` where a keyframe, or what was in the window before, is left open.
+        """
+        graph = gtsam.NonlinearFactorGraph(window)
+        graph.push_back(self.graph)
+        found: list[Withheld] = []
+        for open_ in left_open(graph, values, sorted({*graph.keyVector(), *self._new_keys})):
+            if gtsam.symbolChr(open_.key) == ord("x") or open_.key not in self._new_keys:
+                raise EstimatorError(f"isam2: {self._explained(open_, self._labelled(graph, open_.key))}")
+            found.append(self._without(open_))
+        return found or self.undetermined(values, LEAST_SAID)
 
-def _placed(key: int, factors: list[gtsam.NonlinearFactor], times_s: dict[int, float]) -> str:
-    """A variable by name, with the keyframes that its factors tie it to."""
-    keyframes = sorted({k for factor in factors for k in list(factor.keys()) if gtsam.symbolChr(k) == ord("x")})
-    if gtsam.symbolChr(key) == ord("x"):
-        keyframes = [key]
-    at = ", ".join(f"{variable_name(k)} at {times_s[k]:.3f} s" for k in keyframes if k in times_s)
-    if gtsam.symbolChr(key) == ord("x"):
-        return at or variable_name(key)
-    return f"{variable_name(key)}, from {at}" if at else variable_name(key)
+    def reasons(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> str:
+        """Reason, in words, why a graph has no solution."""
+        if spoilt := [(label, factor) for label, factor in self._labelled(graph) if not is_finite(factor, values)]:
+            return f"{self._told(spoilt)} {SPOILT}; leave the measurement out"
+        found = left_open(graph, values, list(values.keys()))
+        return "; ".join(self._explained(open_, self._labelled(graph, open_.key)) for open_ in found) or (
+            "the graph is determined too weakly for arithmetic of sixteen digits; narrow its priors"
+        )
 
+    def _labelled(self, graph: gtsam.NonlinearFactorGraph, key: int | None = None) -> list[Labelled]:
+        """Factors of a graph, or those on a variable."""
+        labels = {f: label for group in self._store for label, f in group.factors.items()}
+        factors = [graph.at(i) for i in range(graph.size())]
+        return [(labels.get(f, MARGINAL), f) for f in factors if key is None or key in list(f.keys())]
 
-def _without(open_: Open, pending: Pending, times_s: dict[int, float]) -> Withheld:
-    new = pending.on(open_.key)
-    return Withheld(set(new), {open_.key}, f"{explained(open_, list(new.values()), times_s)}; withheld")
+    def _without(self, open_: Open) -> Withheld:
+        on_it = {
+            handle: [(label, f) for label, f in group.factors.items() if open_.key in list(f.keys())]
+            for handle, group in self._store.new.items()
+        }
+        factors = [labelled for group in on_it.values() for labelled in group]
+        handles = {handle for handle, group in on_it.items() if group}
+        return Withheld(handles, {open_.key}, f"{self._explained(open_, factors)}; withheld")
 
+    def _explained(self, open_: Open, factors: list[Labelled]) -> str:
+        """Variable, its factors, the open directions, and what would close them, in words."""
+        missing = MISSING[chr(gtsam.symbolChr(open_.key))]
+        return f"{self._told(factors, open_.key)}; open: {open_.axes()}; {missing}"
 
-def _on(key: int, graph: gtsam.NonlinearFactorGraph) -> list[gtsam.NonlinearFactor]:
-    return [graph.at(i) for i in range(graph.size()) if key in list(graph.at(i).keys())]
+    def _told(self, factors: list[Labelled], key: int | None = None) -> str:
+        """A variable by name, with the keyframes that its factors tie it to, and the number of factors of each label.
+
+        ``key``: None for the landmark, or last variable, of the first factor.
+        """
+        keys = [list(factor.keys()) for _, factor in factors]
+        if key is None:
+            key = max(keys[0], key=lambda k: gtsam.symbolChr(k) == ord("l"))
+        is_pose = gtsam.symbolChr(key) == ord("x")
+        keyframes = [key] if is_pose else sorted({k for ks in keys for k in ks if gtsam.symbolChr(k) == ord("x")})
+        at = ", ".join(f"{variable_name(k)} at {self._times_s[k]:.3f} s" for k in keyframes if k in self._times_s)
+        name = at if is_pose and at else f"{variable_name(key)}, from {at}" if at else variable_name(key)
+        counts = Counter(label for label, _ in factors)
+        return f"{name}: {', '.join(f'{count} {label}' for label, count in counts.items()) or 'no factor'}"
