@@ -138,7 +138,7 @@ def _describe(error: ErrorDetails, model: type[BaseModel]) -> str:
 
 
 def unknown_field(place: Place, model: type[BaseModel]) -> str:
-    """Message that a field does not exist, with the policy that has it, or the most similar one and all there are."""
+    """Message that a field does not exist, with the policy or section that has it, or the most similar one, and all."""
     name, owner = str(place[-1]), _walk(model, place[:-1])
     fault, whose = f"{_path((*owner.names, name))}: there is no such field", _path(owner.names) or "it"
     if owner.value:
@@ -147,7 +147,12 @@ def unknown_field(place: Place, model: type[BaseModel]) -> str:
             having = f"{_path((*owner.names, owner.tag))} = {' or '.join(others)}"
             return f'{fault} with {owner.tag} = "{owner.value}"; {having} has it'
         whose = f'{whose} with {owner.tag} = "{owner.value}"'
-    return fault + choice(name, list(owner.section.model_fields) if owner.section else [], whose)
+    if owner.section is None:
+        return fault + choice(name, [], whose)
+    fields, inside = list(owner.section.model_fields), [setting.name for setting in settings_of(owner.section)]
+    meant = [_path((*owner.names, *dotted.split("."))) for dotted in inside if dotted.endswith(f".{name}")]
+    hint = f"; did you mean {meant[0]}?" if meant else suggestion(name, fields)
+    return f"{fault}{hint} {whose} has: {', '.join(fields)}"
 
 
 def choice(name: str, known: Iterable[str], owner: str = "") -> str:

@@ -20,6 +20,7 @@ def told(text: str) -> str:
         ("gravity = 9.8", "gravity", "gravity_m_s2", "it has: imu, dvl"),
         ("dvl.velocity_sigma = 1", "dvl.velocity_sigma", "velocity_sigma_m_s", "dvl has: velocity_sigma_m_s, mounting"),
         ("imu.mounting.rpy = 1", "imu.mounting.rpy", "rpy_rad", "imu.mounting has: translation_m, rpy_rad"),
+        ("gyro_bias_sigma = 1", "gyro_bias_sigma", "imu.gyro_bias_sigma", "it has: imu, dvl"),
         ("floor = {z_m = 1, sigma_m = 1, z = 1}", "floor.z", "z_m", "floor has: z_m, sigma_m"),
     ],
 )

@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Self
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import L
-from pydantic import BaseModel, model_validator
+from pydantic import model_validator
 
 from sonar_graph.calibration import Calibration, Section, misfits
 from sonar_graph.errors import CalibrationError, EstimatorError
@@ -28,34 +28,6 @@ from sonar_graph.slam.landmarks import IdentityParams, MixtureIdentity, RobustId
 from sonar_graph.slam.models import KernelParams, RobustKernel
 from sonar_graph.slam.smoother import HistoryParams, JointCovariance, Smoother, SmootherParams, WholeHistory
 from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, RefusedRow, Trajectory
-
-OLD_NAMES = {
-    "lag_s": "smoother.lag_s",
-    "relinearize_threshold": "smoother.relinearize_threshold",
-    "stale_shift_m": "smoother.stale_shift_m",
-    "waiting_gain": "smoother.waiting_gain",
-    "history": "history.policy",
-    "remembered_s": "history.remembered_s",
-    "max_keyframe_interval_s": "keyframes.max_interval_s",
-    "motion_noise_share": "keyframes.motion_noise_share",
-    "bias_interval_s": "keyframes.bias_interval_s",
-    "kernel": "kernel.shape",
-    "kernel_width": "kernel.width",
-    "identity_policy": "identity.policy",
-    "identity_probability": "identity.minimum_probability",
-    "gate_probability": "identity.gate_probability",
-    "deferred_identity": "identity.longest_wait_s, where 0 turns it off",
-    "longest_wait_s": "identity.longest_wait_s",
-    "wrong_id_probability": "identity.wrong_id_probability",
-    "view_range_m": "identity.view_range_m",
-    "view_azimuth_rad": "identity.view_azimuth_rad",
-    "unknown_landmarks": "identity.unknown.policy",
-    "unknown_gate_probability": "identity.unknown.gate_probability",
-    "unknown_density_m2": "identity.unknown.density_m2",
-    "unknown_sightings": "identity.unknown.sightings",
-    "unknown_wait_s": "identity.unknown.longest_wait_s",
-}
-"""Flat names that settings had before they were in sections."""
 
 
 class Isam2Params(Section):
@@ -71,15 +43,6 @@ class Isam2Params(Section):
     """Shape of the noise of range and of azimuth, under every identity policy."""
     identity: IdentityParams = RobustIdentity()
     """Policy for identities that may be wrong (docs/theory/doubtful_identities.md)."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _refuse_old_names(cls, given: Any) -> Any:
-        fields = given if isinstance(given, dict) else {}
-        old = [name for name in OLD_NAMES if name in fields and not isinstance(fields[name], dict | BaseModel)]
-        if old:
-            raise misfits(cls, {name: f"{name} is now {OLD_NAMES[name]}" for name in old})
-        return given
 
     @model_validator(mode="after")
     def _check_history(self) -> Self:

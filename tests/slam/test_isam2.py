@@ -21,7 +21,6 @@ from sonar_graph.sequence import Sequence
 from sonar_graph.settings import nested, settings_of
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 from sonar_graph.slam import Isam2, Isam2Params
-from sonar_graph.slam.isam2 import OLD_NAMES
 from sonar_graph.states import Estimate, Outcome
 from sonar_graph.testing import check_consistent, laws
 from sonar_graph.testing.drives import misnamed_world, small_world, still_world
@@ -304,6 +303,10 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         {"smoother": {"lag": 3}},
         "smoother.lag: there is no such field; did you mean lag_s? smoother has",
     ),
+    "its section is missing": (
+        {"unknown.density_m2": 1, "lag_s": 20},
+        "lag_s: there is no such field; did you mean smoother.lag_s? it has: keyframes, smoother, history, kernel",
+    ),
     "out of range": ({"identity.policy": "gate", "identity.gate_probability": 2}, "identity.gate_probability: Input"),
 }
 
@@ -313,15 +316,6 @@ def test_what_a_policy_does_not_read_is_refused_by_name(given: dict[str, Any], f
     with pytest.raises(EstimatorError) as refused:
         make_params(Isam2, given, "isam2")
     assert fault in str(refused.value)
-
-
-@pytest.mark.parametrize("old", OLD_NAMES)
-def test_an_old_name_says_the_new_one(old: str) -> None:
-    with pytest.raises(EstimatorError) as refused:
-        make_params(Isam2, {old: "x"}, "isam2")
-    new = OLD_NAMES[old]
-    assert str(refused.value) == f"settings of isam2: {old} is now {new}"
-    assert new.split(",")[0] in {setting.name for setting in settings_of(Isam2Params)}
 
 
 def test_a_section_keeps_its_default_policy_where_none_is_given() -> None:
