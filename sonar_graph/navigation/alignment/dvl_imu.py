@@ -24,6 +24,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
@@ -33,7 +34,7 @@ from sonar_graph.navigation.alignment.at_rest import in_body_axes
 from sonar_graph.navigation.alignment.time_offset import RANGE_S, Estimate1D, SampleSeries, search_offset
 from sonar_graph.navigation.imu_gaps import UNFELT_NS, row_after_hole
 from sonar_graph.navigation.samples import is_partial
-from sonar_graph.numerics import compiled, rotation_exp
+from sonar_graph.numerics import running_rotations
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,22 +111,14 @@ def holes_before(stamps_ns: Ints) -> Ints:
     return np.cumsum(ends_hole)
 
 
-@compiled
 def strapdown_integrals(seconds: Floats, rate: Floats, force: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     """C, F, S and P of the module's equations at every sample."""
-    n = len(seconds)
-    rotations, impulse, turned, tilted = np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
-    rotations[0] = np.eye(3)
-    for i in range(1, n):
-        half = 0.5 * (seconds[i] - seconds[i - 1])
-        rotations[i] = rotations[i - 1] @ rotation_exp(half * (rate[i - 1] + rate[i]))
-        before, after = rotations[i - 1] @ force[i - 1], rotations[i] @ force[i]
-        impulse[i] = impulse[i - 1] + half * (before + after)
-        turned[i] = turned[i - 1] + half * (rotations[i - 1] + rotations[i])
-        for j in range(3):
-            felt = np.cross(before, turned[i - 1, :, j]) + np.cross(after, turned[i, :, j])
-            tilted[i, :, j] = tilted[i - 1, :, j] + half * felt
-    return rotations, impulse, turned, tilted
+    turns = 0.5 * (rate[:-1] + rate[1:]) * np.diff(seconds)[:, None]
+    integral = partial(cumulative_trapezoid, x=seconds, axis=0, initial=0.0)
+    C = running_rotations(turns)
+    felt = C @ force[:, :, None]
+    S = integral(C)
+    return C, integral(felt[:, :, 0]), S, integral(np.cross(felt, S, axis=1))
 
 
 STRETCH_S = 30.0

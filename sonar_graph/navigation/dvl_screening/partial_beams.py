@@ -33,11 +33,12 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.navigation.imu_gaps import UNFELT_NS, row_after_hole
-from sonar_graph.numerics import compiled, rotation_exp
+from sonar_graph.numerics import running_rotations
 
 EARTH_RATE_RAD_S = 7.3e-5
 
@@ -84,29 +85,18 @@ def carry(imu: InertialRows, stamps_ns: Ints, calibration: Calibration) -> Carry
     middles_ns = times_ns[:-1] + np.diff(times_ns) // 2
     turns = imu.at(imu.rate, middles_ns) * (np.diff(times_ns) * 1e-9)[:, None]
     gains = imu.at(imu.specific_force, middles_ns) * (np.diff(times_ns) * 1e-9)[:, None]
-    rotation, velocity, turned_rad = integrate_pieces(turns, gains)
+    rotation, velocity = running_rotations(turns), np.zeros((len(times_ns), 3))
+    gained = rotation[:-1] @ Rotation.from_rotvec(0.5 * turns).as_matrix() @ gains[:, :, None]
+    velocity[1:] = np.cumsum(gained[:, :, 0], axis=0)
     at = np.searchsorted(times_ns, stamps_ns)
     arm = np.subtract(calibration.imu.mounting.translation_m, calibration.dvl.mounting.translation_m)
     stretch_s, sensors, g = float(stamps_ns[-1] - stamps_ns[0]) * 1e-9, calibration.imu, calibration.gravity_m_s2
     bias2 = sensors.gyro_bias_sigma**2 + EARTH_RATE_RAD_S**2
     by_gyro = g**2 * (sensors.gyro_noise_density**2 * stretch_s**2 / 12.0 + bias2 * stretch_s**3 / 16.0)
+    turned_rad = float(np.linalg.norm(turns, axis=1).sum())
     by_turning = (sensors.accel_bias_sigma * turned_rad) ** 2 * stretch_s / 16.0
     density = float(np.sqrt(sensors.accel_noise_density**2 + by_gyro + by_turning))
     return Carry(rotation[at], velocity[at], np.cross(imu.at(imu.rate, stamps_ns), arm), density, True)
-
-
-@compiled
-def integrate_pieces(turns: Floats, gains: Floats) -> tuple[Floats, Floats, float]:
-    """R and F at the ends of all pieces, and the angle turned in all."""
-    n = len(turns)
-    rotation, velocity = np.empty((n + 1, 3, 3)), np.zeros((n + 1, 3))
-    rotation[0] = np.eye(3)
-    turned_rad = 0.0
-    for k in range(n):
-        velocity[k + 1] = velocity[k] + rotation[k] @ (rotation_exp(0.5 * turns[k]) @ gains[k])
-        rotation[k + 1] = rotation[k] @ rotation_exp(turns[k])
-        turned_rad += np.sqrt(np.sum(turns[k] ** 2))
-    return rotation, velocity, turned_rad
 
 
 LONGEST_STRETCH_NS = 60_000_000_000
