@@ -22,7 +22,7 @@ import math
 
 import numpy as np
 
-from baselines.filter import Motion, SonarModel, far_view, polar_covariance
+from baselines.filter import Motion, SonarModel, View, far_view, polar_covariance
 from sonar_graph.measurements import Floats
 from sonar_graph.numerics import compiled, inlined
 from sonar_graph.numerics.matrices import (
@@ -164,7 +164,7 @@ def correct_depth(
 @compiled
 def observe(
     x: Floats, P: Floats, at: int, dR_: Floats, dp_: Floats, C: Floats,
-    body_R_sonar: Floats, body_p_sonar: Floats, z: Floats, R_z: Floats, gate: float,
+    body_R_sonar: Floats, body_p_sonar: Floats, z: View, R_z: Floats, gate: float,
 ) -> tuple[bool, Floats, Floats]:  # fmt: skip
     """Update by range and azimuth of the landmark at ``x[at : at + 3]``, where its innovation is inside the gate.
 
@@ -224,7 +224,7 @@ def pose_after(x: Floats, P: Floats, motion: Motion) -> tuple[Floats, Floats, Fl
 
 
 def location(
-    x: Floats, motion: Motion, sonar: SonarModel, z: Floats, elevation_rad: float
+    x: Floats, motion: Motion, sonar: SonarModel, z: View, elevation_rad: float
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """The point ``g(x_v, z, elevation) = X' + R' q`` that a detection shows, and its derivatives.
 
@@ -238,7 +238,7 @@ def location(
     return X + R @ q, G_b @ T, G_b, R @ sonar.body_R_sonar @ sonar_point_jacobian(z[0], z[1], elevation_rad)
 
 
-def augment(x: Floats, P: Floats, motion: Motion, sonar: SonarModel, z: Floats, R_z: Floats) -> tuple[Floats, Floats]:
+def augment(x: Floats, P: Floats, motion: Motion, sonar: SonarModel, z: View, R_z: Floats) -> tuple[Floats, Floats]:
     """State and covariance with a new landmark where it was seen, on a floor of known height within the floor's gate.
 
     ``P_pv = G_v P_v.``,  ``P_pp = G_v P_vv G_v^T + G_b C G_b^T + G_z diag(R_z, elevation_sigma^2) G_z^T``.
@@ -254,7 +254,7 @@ def augment(x: Floats, P: Floats, motion: Motion, sonar: SonarModel, z: Floats, 
 
 
 def observe_far(
-    x: Floats, P: Floats, at: int, motion: Motion, sonar: SonarModel, z: Floats, R_z: Floats
+    x: Floats, P: Floats, at: int, motion: Motion, sonar: SonarModel, z: View, R_z: Floats
 ) -> tuple[bool, Floats, Floats] | None:
     """Update as `observe` by a landmark far from where it is predicted, by the point seen (`far_view`); else None."""
     seen, G_v, G_b, G_z = location(x, motion, sonar, z, 0.0)

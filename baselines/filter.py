@@ -24,7 +24,7 @@ from pydantic import Field
 
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
 from sonar_graph.errors import EstimatorError, MeasurementError
-from sonar_graph.measurements import Depth, Floats, LandmarkDetections, Measurements
+from sonar_graph.measurements import Floats, LandmarkDetections, Measurements
 from sonar_graph.motion import MotionSource
 from sonar_graph.navigation.alignment import earth_rate_in_world, tilt_sigma, up_direction
 from sonar_graph.numerics import compiled
@@ -134,6 +134,11 @@ def in_order(happening: list[tuple[int, int, int]], node_ns: int, opened_ns: int
 # ------------------------------------------------------------------------------------------------- detections
 
 
+View = tuple[float, float]
+"""Range (m) and azimuth (rad) of a detection."""
+NO_VIEWS: tuple[list[View], Floats] = ([], np.empty((0, 2, 2)))
+
+
 class SonarModel(NamedTuple):
     """Sonar mounting and noise, gate, and floor."""
 
@@ -166,11 +171,11 @@ class SonarModel(NamedTuple):
         """Covariances of detections: symmetric, and the calibration's where the log has none, shape (m, 2, 2)."""
         logged = detections.range_azimuth_cov
         R_z = 0.5 * (logged + logged.transpose(0, 2, 1))
-        missing = np.isnan(R_z.reshape(-1, 4)).any(axis=1)
-        R_z[missing] = self.R_z
+        if np.isnan(R_z).any():
+            R_z[np.isnan(R_z).any(axis=(1, 2))] = self.R_z
         return R_z
 
-    def elevation_of_new(self, R: Floats, X: Floats, z: Floats) -> float:
+    def elevation_of_new(self, R: Floats, X: Floats, z: View) -> float:
         """Elevation of a new landmark seen from a body: on the floor, or 0 without a floor within the aperture."""
         body_T_sonar = gtsam.Pose3(gtsam.Rot3(self.body_R_sonar), self.body_p_sonar)
         world_T_sonar = gtsam.Pose3(gtsam.Rot3(R), X).compose(body_T_sonar)
@@ -201,7 +206,7 @@ class FarView(NamedTuple):
     is_inside_gate: bool
 
 
-def far_view(missed: Floats, cov: Floats, G_z: Floats, sonar: SonarModel, z: Floats, R_z: Floats) -> FarView | None:
+def far_view(missed: Floats, cov: Floats, G_z: Floats, sonar: SonarModel, z: View, R_z: Floats) -> FarView | None:
     """Compare a landmark with the point seen, which is linear in both positions; None where `observe` is linear enough.
 
     With the variances A along the beam and L across it, in the sonar's plane, the linearisation at the predicted place
@@ -248,8 +253,6 @@ def check_rows(measurements: Measurements) -> None:
 
 # ------------------------------------------------------------------------------------------------- the shell
 
-NO_HEIGHTS: list[tuple[float, float]] = []
-NO_VIEWS, NO_NOISE = np.empty((0, 2)), np.empty((0, 2, 2))
 Told = tuple[Outcome, Floats | None, Floats | None]
 """Outcome of a detection, with innovation (2,) and its covariance (2, 2) where there was a prediction."""
 NOT_STARTED, LONG_AGO = int(np.iinfo(np.int64).max), int(np.iinfo(np.int64).min)
@@ -278,7 +281,8 @@ class FilterShell(ABC):
         self.calibration, self.odometry = calibration, odometry
         self.sonar = SonarModel.of(calibration, params.gate_probability)
         self.port = np.array(calibration.depth.port_m)
-        self._params, self._earth = params, earth_rate_in_world(calibration)
+        self._minimum_id_probability, self._earth = params.minimum_id_probability, earth_rate_in_world(calibration)
+        self._plane, self._depth_variance = calibration.planar, calibration.depth.sigma_m**2
         self._interval_ns = round(params.gravity_interval_s * 1e9) if calibration.use_gravity else 0
         self.node_ns = 0
         """Stamp of the newest epoch, that of the state."""
@@ -309,7 +313,7 @@ class FilterShell(ABC):
 
     @abstractmethod
     def observe(
-        self, motion: Motion, slot: int, z: Floats, R_z: Floats, *, may_be_far: bool
+        self, motion: Motion, slot: int, z: View, R_z: Floats, *, may_be_far: bool
     ) -> tuple[bool, Floats, Floats]:
         """Update by range and azimuth of a known landmark, a motion after the state, where the gate admits it.
 
@@ -318,7 +322,7 @@ class FilterShell(ABC):
         """
 
     @abstractmethod
-    def augment(self, motion: Motion, z: Floats, R_z: Floats) -> None:
+    def augment(self, motion: Motion, z: View, R_z: Floats) -> None:
         """Append a landmark seen for the first time, a motion after the state."""
 
     @abstractmethod
@@ -409,14 +413,14 @@ class FilterShell(ABC):
 
     def _sorted_out(
         self, detections: LandmarkDetections | None, since_ns: int
-    ) -> tuple[list[int], list[Told], list[list[int]]]:
-        """Most probable identities and refusals of detections, and the rows of each frame that are to be used.
+    ) -> tuple[list[int], list[Told], dict[int, list[int]]]:
+        """Most probable identities and refusals of detections, and rows to be used by the stamps of their frames.
 
         Rows before the first epoch is reached, or older than those done, are refused.
         """
         if detections is None:
-            return [], [], []
-        identities = identify(detections, self._params.minimum_id_probability)
+            return [], [], {}
+        identities = identify(detections, self._minimum_id_probability)
         told: list[Told] = []
         frames: dict[int, list[int]] = {}
         for row, stamp_ns in enumerate(detections.stamps_ns.tolist()):
@@ -426,40 +430,50 @@ class FilterShell(ABC):
             told.append((reason or Outcome.USED, None, None))
             if reason is None:
                 frames.setdefault(stamp_ns, []).append(row)
-        return identities.ids.tolist(), told, list(frames.values())
+        return identities.ids.tolist(), told, frames
 
     def _use(
-        self, measurements: Measurements, since_ns: int, ids: list[int], told: list[Told], frames: list[list[int]]
+        self, measurements: Measurements, since_ns: int, ids: list[int], told: list[Told], frames: dict[int, list[int]]
     ) -> Estimate:
         """Carry the state to the newest epoch reached at the end of the call, with all measurements on the way."""
         end_ns, depth, detections = measurements.end_ns, measurements.depth, measurements.detections
         epochs_ns = self.odometry.epochs(self.node_ns, end_ns)
         reached_ns = self.odometry.reached_ns(epochs_ns)
         happening = list(zip(reached_ns.tolist(), [EPOCH] * len(epochs_ns), epochs_ns.tolist(), strict=True))
-        heights, z, R_z = NO_HEIGHTS, NO_VIEWS, NO_NOISE
+        happening.append((end_ns, END, 0))
+        heights: list[tuple[float, float]] = []
         if depth is not None:
-            heights = list(zip(depth.z_m.tolist(), self._depth_variances(depth), strict=True))
+            heights = list(zip(depth.z_m.tolist(), depth.variance_m2.tolist(), strict=True))
             happening += [(t, DEPTH, row) for row, t in enumerate(depth.stamps_ns.tolist()) if t >= since_ns]
+        z, R_z = NO_VIEWS
         if detections is not None and frames:
-            z, R_z = np.column_stack([detections.range_m, detections.azimuth_rad]), self.sonar.noise_of(detections)
-            happening += [(int(detections.stamps_ns[rows[0]]), FRAME, k) for k, rows in enumerate(frames)]
-        events = in_order([*happening, (end_ns, END, 0)], self.node_ns, self._opened_ns, self._interval_ns)
-        stamps_ns, _, _, starts_ns, ends_ns = np.array(events).T.copy()
-        motions = self.odometry.motions(starts_ns, ends_ns, stamps_ns, NO_BIAS)
-        for event, *values in zip(events, *motions, strict=True):
-            motion = self._corrected(event, Motion(*values))
-            if event.kind == EPOCH:
-                self.predict(motion, (event.end_ns - event.start_ns) * 1e-9)
-                self.node_ns, self._in_gap = event.end_ns, {DEPTH: 0, FRAME: 0}
-                if self.calibration.planar:
-                    self.correct_plane(self.calibration.planar)
-            elif event.kind == GRAVITY:
+            z = list(zip(detections.range_m.tolist(), detections.azimuth_rad.tolist(), strict=True))
+            R_z = self.sonar.noise_of(detections)
+            happening += [(stamp_ns, FRAME, stamp_ns) for stamp_ns in frames]
+        events = in_order(happening, self.node_ns, self._opened_ns, self._interval_ns)
+        known_ns, _, _, starts_ns, ends_ns = np.array(events).T.copy()
+        motions = self.odometry.motions(starts_ns, ends_ns, known_ns, NO_BIAS)
+        has_gap = np.isnan(motions.dp[:, 0]).tolist()
+        has_rate = self._earth is not None or self.gyro_bias() is not None
+        for event, is_over_gap, *values in zip(events, has_gap, *motions, strict=True):
+            stamp_ns, kind, row, _, _ = event
+            motion = Motion(*values)
+            if is_over_gap:
+                motion = self._over_gap(event, len(frames[row]) if kind == FRAME else int(kind == DEPTH))
+            elif has_rate:
+                motion = self._without_rate(event, motion)
+            if kind == EPOCH:
+                self.predict(motion, (row - self.node_ns) * 1e-9)
+                self.node_ns, self._in_gap = row, {DEPTH: 0, FRAME: 0}
+                if self._plane:
+                    self.correct_plane(self._plane)
+            elif kind == GRAVITY:
                 self._use_gravity(event, motion)
-            elif event.kind == DEPTH:
-                self.correct_depth(self._shared(event, 1, motion), *heights[event.row])
-            elif event.kind == FRAME:
-                motion = self._shared(event, len(frames[event.row]), motion)
-                for row in frames[event.row]:
+            elif kind == DEPTH:
+                z_m, variance_m2 = heights[row]
+                self.correct_depth(motion, z_m, self._depth_variance if math.isnan(variance_m2) else variance_m2)
+            elif kind == FRAME:
+                for row in frames[stamp_ns]:
                     told[row] = self._see(ids[row], motion, z[row], R_z[row])
         R, X, covariance = self.pose_after(motion)
         self.odometry.settle(self.node_ns)
@@ -468,42 +482,32 @@ class FilterShell(ABC):
             self._kept_ns = needed_ns
         return Estimate(end_ns, gtsam.Pose3(gtsam.Rot3(R), X), covariance)
 
-    def _depth_variances(self, depth: Depth) -> list[float]:
-        """Variances of depth samples, m²: the calibration's where the log has none."""
-        given = depth.variance_m2
-        return np.where(np.isnan(given), self.calibration.depth.sigma_m**2, given).tolist()
+    def _without_rate(self, event: Event, motion: Motion) -> Motion:
+        """The motion without the gyro bias of the state and the Earth's rate."""
+        bias, R_i = self.gyro_bias(), self._opened_R if event.kind == GRAVITY else self.attitude()
+        earth = NO_RATE if self._earth is None else R_i.T @ self._earth
+        dR, dp, C, D, impulse = motion
+        dR, dp, impulse = corrected(dR, dp, D, impulse, NO_BIAS if bias is None else bias, earth)
+        return Motion(dR, dp, C, D, impulse)
 
-    def _corrected(self, event: Event, motion: Motion) -> Motion:
-        """The motion without the gyro bias of the state and the Earth's rate, over gaps too.
+    def _over_gap(self, event: Event, count: int) -> Motion:
+        """Motion over a gap of the Doppler log, with the share of its error that so many more measurements may have.
 
         A state without bias has no place for what an unknown one does in a gap, where it tilts gravity: it is added to
         the covariance of the displacement. Elsewhere its drift is left out, as published.
         """
-        bias = self.gyro_bias()
-        is_gap = math.isnan(motion.dp[0])
-        if not is_gap and bias is None and self._earth is None:
-            return motion
-        R_i = self._opened_R if event.kind == GRAVITY else self.attitude()
+        bias, R_i = self.gyro_bias(), self._opened_R if event.kind == GRAVITY else self.attitude()
         removed = NO_BIAS if bias is None else bias
-        if not is_gap:
-            earth = NO_RATE if self._earth is None else R_i.T @ self._earth
-            dR, dp, impulse = corrected(motion.dR, motion.dp, motion.D, motion.impulse, removed, earth)
-            return Motion(dR, dp, motion.C, motion.D, impulse)
         over = self.odometry.motion(event.start_ns, event.end_ns, removed, R_i, event.stamp_ns)
         C, D = over.covariance.copy(), over.D_bias
         if bias is None:
             C[3:, 3:] += self.calibration.imu.gyro_bias_sigma**2 * D[3:] @ D[3:].T
-        dR, dp = np.ascontiguousarray(over.i_T_j.rotation().matrix()), over.i_T_j.translation()
+        if count:
+            self._in_gap[event.kind] += count
+            C *= self._in_gap[event.kind] * (self._in_gap[event.kind] + 1)
         self._was_lost = True
-        return Motion(dR, dp, C, D, over.mean_specific_force * over.duration_s)
-
-    def _shared(self, event: Event, count: int, motion: Motion) -> Motion:
-        """The motion with the share of its error that so many more measurements over one gap may each have."""
-        if not self.odometry.is_gap(event.start_ns, event.end_ns):
-            return motion
-        self._in_gap[event.kind] += count
-        k = self._in_gap[event.kind]
-        return motion._replace(C=k * (k + 1) * motion.C)
+        dR = np.ascontiguousarray(over.i_T_j.rotation().matrix())
+        return Motion(dR, over.i_T_j.translation(), C, D, over.mean_specific_force * over.duration_s)
 
     def _use_gravity(self, event: Event, motion: Motion) -> None:
         """Update by the direction of gravity over an interval that ends at the state's epoch."""
@@ -517,7 +521,7 @@ class FilterShell(ABC):
         self._opened_ns, self._opened_velocity = event.end_ns, (velocity_j, variance_j)
         self._opened_R = self.attitude()
 
-    def _see(self, landmark_id: int, motion: Motion, z: Floats, R_z: Floats) -> Told:
+    def _see(self, landmark_id: int, motion: Motion, z: View, R_z: Floats) -> Told:
         """Update by a detection of a landmark, or append the landmark at first sight."""
         if landmark_id not in self._slots:
             self.augment(motion, z, R_z)
