@@ -22,7 +22,7 @@ import math
 
 import numpy as np
 
-from baselines.filter import Motion, SonarModel, View, far_view, polar_covariance
+from baselines.filter import Motion, SonarModel, correction, far_view, polar_covariance
 from sonar_graph.measurements import Floats
 from sonar_graph.numerics import compiled, inlined
 from sonar_graph.numerics.matrices import (
@@ -80,30 +80,10 @@ def predict(x: Floats, P: Floats, dR_: Floats, dp_: Floats, C: Floats) -> None:
 
 @compiled
 def correct(x: Floats, P: Floats, U: Floats, S: Floats, e: Floats) -> None:
-    """Update by m numbers: ``K = P H^T S^-1``, ``x <- x + K e``, ``P <- P - K S K^T``, from ``U = H P`` (m, n).
-
-    With ``S = L L^T`` and ``V = L^-1 U`` that is ``P - V^T V``, row by row. Both factors of every product commute, so
-    that P stays symmetric to the last bit.
-    """
-    n, L, V, y = len(x), S.copy(), U.copy(), e.copy()
-    for r in range(len(e)):
-        for c in range(r):
-            L[r, r] -= L[r, c] * L[r, c]
-            y[r] -= L[r, c] * y[c]
-            for i in range(n):
-                V[r, i] -= L[r, c] * V[c, i]
-        L[r, r] = math.sqrt(L[r, r])
-        for k in range(r + 1, len(e)):
-            for c in range(r):
-                L[k, r] -= L[k, c] * L[r, c]
-            L[k, r] /= L[r, r]
-        y[r] /= L[r, r]
-        for i in range(n):
-            V[r, i] /= L[r, r]
-        for i in range(n):
-            x[i] += V[r, i] * y[r]
-            for j in range(n):
-                P[i, j] -= V[r, i] * V[r, j]
+    """Update by m numbers: ``x <- x + K e``, ``P <- P - K S K^T``, from ``U = H P`` (m, n); roll and yaw wrapped."""
+    Ke = correction(P, U, S, e)
+    for i in range(len(x)):
+        x[i] += Ke[i]
     x[3], x[5] = wrap_angle(x[3]), wrap_angle(x[5])
 
 
@@ -164,7 +144,7 @@ def correct_depth(
 @compiled
 def observe(
     x: Floats, P: Floats, at: int, dR_: Floats, dp_: Floats, C: Floats,
-    body_R_sonar: Floats, body_p_sonar: Floats, z: View, R_z: Floats, gate: float,
+    body_R_sonar: Floats, body_p_sonar: Floats, z: Floats, R_z: Floats, gate: float,
 ) -> tuple[bool, Floats, Floats]:  # fmt: skip
     """Update by range and azimuth of the landmark at ``x[at : at + 3]``, where its innovation is inside the gate.
 
@@ -224,7 +204,7 @@ def pose_after(x: Floats, P: Floats, motion: Motion) -> tuple[Floats, Floats, Fl
 
 
 def location(
-    x: Floats, motion: Motion, sonar: SonarModel, z: View, elevation_rad: float
+    x: Floats, motion: Motion, sonar: SonarModel, z: Floats, elevation_rad: float
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """The point ``g(x_v, z, elevation) = X' + R' q`` that a detection shows, and its derivatives.
 
@@ -238,7 +218,7 @@ def location(
     return X + R @ q, G_b @ T, G_b, R @ sonar.body_R_sonar @ sonar_point_jacobian(z[0], z[1], elevation_rad)
 
 
-def augment(x: Floats, P: Floats, motion: Motion, sonar: SonarModel, z: View, R_z: Floats) -> tuple[Floats, Floats]:
+def augment(x: Floats, P: Floats, motion: Motion, sonar: SonarModel, z: Floats, R_z: Floats) -> tuple[Floats, Floats]:
     """State and covariance with a new landmark where it was seen, on a floor of known height within the floor's gate.
 
     ``P_pv = G_v P_v.``,  ``P_pp = G_v P_vv G_v^T + G_b C G_b^T + G_z diag(R_z, elevation_sigma^2) G_z^T``.
@@ -254,7 +234,7 @@ def augment(x: Floats, P: Floats, motion: Motion, sonar: SonarModel, z: View, R_
 
 
 def observe_far(
-    x: Floats, P: Floats, at: int, motion: Motion, sonar: SonarModel, z: View, R_z: Floats
+    x: Floats, P: Floats, at: int, motion: Motion, sonar: SonarModel, z: Floats, R_z: Floats
 ) -> tuple[bool, Floats, Floats] | None:
     """Update as `observe` by a landmark far from where it is predicted, by the point seen (`far_view`); else None."""
     seen, G_v, G_b, G_z = location(x, motion, sonar, z, 0.0)

@@ -11,7 +11,7 @@ import numpy as np
 
 from baselines import ekf_equations
 from baselines.ekf_equations import LANDMARK, POSE
-from baselines.filter import FilterParams, FilterShell, Motion, View
+from baselines.filter import FilterParams, FilterShell, Motion
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats
@@ -99,7 +99,7 @@ class EkfSlam(FilterShell):
         ekf_equations.correct_depth(self._x, self._P, motion.dR, motion.dp, motion.C, self.port, z_m, variance_m2)
 
     def observe(
-        self, motion: Motion, slot: int, z: View, R_z: Floats, *, may_be_far: bool
+        self, motion: Motion, slot: int, z: Floats, R_z: Floats, *, may_be_far: bool
     ) -> tuple[bool, Floats, Floats]:
         """Update by range and azimuth of a known landmark, (6) and (7)."""
         at, sonar = POSE + LANDMARK * slot, self.sonar
@@ -110,7 +110,7 @@ class EkfSlam(FilterShell):
             self._x, self._P, at, dR, dp, C, sonar.body_R_sonar, sonar.body_p_sonar, z, R_z, sonar.gate
         )
 
-    def augment(self, motion: Motion, z: View, R_z: Floats) -> None:
+    def augment(self, motion: Motion, z: Floats, R_z: Floats) -> None:
         """Append a landmark to (4) and (5)."""
         self._x, self._P = ekf_equations.augment(self._x, self._P, motion, self.sonar, z, R_z)
 

@@ -25,7 +25,7 @@ from pydantic import Field
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
 from sonar_graph.errors import EstimatorError, MeasurementError
 from sonar_graph.measurements import Floats, LandmarkDetections, Measurements
-from sonar_graph.motion import MotionSource
+from sonar_graph.motion import Motions, MotionSource
 from sonar_graph.navigation.alignment import earth_rate_in_world, tilt_sigma, up_direction
 from sonar_graph.numerics import compiled
 from sonar_graph.numerics.matrices import block, cross, exp_and_mean, mat, store, vec
@@ -57,19 +57,8 @@ class FilterParams(Section):
 # ------------------------------------------------------------------------------------------------- motions and events
 
 
-class Motion(NamedTuple):
-    """Motion i_T_j, its perturbation [theta, rho] in frame j: ``dR Exp(theta)``, ``dp + dR rho``."""
-
-    dR: Floats
-    """i_R_j, shape (3, 3)."""
-    dp: Floats
-    """i_p_j, shape (3,), m."""
-    C: Floats
-    """Covariance of the perturbation, shape (6, 6)."""
-    D: Floats
-    """Derivative of the perturbation by the gyro bias, shape (6, 3), per rad/s."""
-    impulse: Floats
-    """Integral of the specific force in frame i, shape (3,), m/s; NaN where not measured."""
+class Motion(Motions):
+    """One row of `Motions`: i_T_j with covariance C, derivative D by the gyro bias, and impulse."""
 
 
 @compiled
@@ -131,12 +120,38 @@ def in_order(happening: list[tuple[int, int, int]], node_ns: int, opened_ns: int
     return events
 
 
-# ------------------------------------------------------------------------------------------------- detections
+# ------------------------------------------------------------------------------------------------- update, detections
 
 
-View = tuple[float, float]
-"""Range (m) and azimuth (rad) of a detection."""
-NO_VIEWS: tuple[list[View], Floats] = ([], np.empty((0, 2, 2)))
+@compiled
+def correction(P: Floats, U: Floats, S: Floats, e: Floats) -> Floats:
+    """``K e`` (n,) of an update by m numbers, ``K = P H^T S^-1``, from ``U = H P`` (m, n); P becomes ``P - K S K^T``.
+
+    With ``S = L L^T`` and ``V = L^-1 U`` that is ``P - V^T V``, row by row. Both factors of every product commute, so
+    that P stays symmetric to the last bit. Raises LinAlgError where S is not positive definite.
+    """
+    n, L, V, y, Ke = len(P), S.copy(), U.copy(), e.copy(), np.zeros(len(P))
+    for r in range(len(e)):
+        for c in range(r):
+            L[r, r] -= L[r, c] * L[r, c]
+            y[r] -= L[r, c] * y[c]
+            for i in range(n):
+                V[r, i] -= L[r, c] * V[c, i]
+        if not L[r, r] > 0.0:
+            raise np.linalg.LinAlgError("the covariance of an innovation is not positive definite")
+        L[r, r] = math.sqrt(L[r, r])
+        for k in range(r + 1, len(e)):
+            for c in range(r):
+                L[k, r] -= L[k, c] * L[r, c]
+            L[k, r] /= L[r, r]
+        y[r] /= L[r, r]
+        for i in range(n):
+            V[r, i] /= L[r, r]
+        for i in range(n):
+            Ke[i] += V[r, i] * y[r]
+            for j in range(n):
+                P[i, j] -= V[r, i] * V[r, j]
+    return Ke
 
 
 class SonarModel(NamedTuple):
@@ -175,7 +190,7 @@ class SonarModel(NamedTuple):
             R_z[np.isnan(R_z).any(axis=(1, 2))] = self.R_z
         return R_z
 
-    def elevation_of_new(self, R: Floats, X: Floats, z: View) -> float:
+    def elevation_of_new(self, R: Floats, X: Floats, z: Floats) -> float:
         """Elevation of a new landmark seen from a body: on the floor, or 0 without a floor within the aperture."""
         body_T_sonar = gtsam.Pose3(gtsam.Rot3(self.body_R_sonar), self.body_p_sonar)
         world_T_sonar = gtsam.Pose3(gtsam.Rot3(R), X).compose(body_T_sonar)
@@ -206,7 +221,7 @@ class FarView(NamedTuple):
     is_inside_gate: bool
 
 
-def far_view(missed: Floats, cov: Floats, G_z: Floats, sonar: SonarModel, z: View, R_z: Floats) -> FarView | None:
+def far_view(missed: Floats, cov: Floats, G_z: Floats, sonar: SonarModel, z: Floats, R_z: Floats) -> FarView | None:
     """Compare a landmark with the point seen, which is linear in both positions; None where `observe` is linear enough.
 
     With the variances A along the beam and L across it, in the sonar's plane, the linearisation at the predicted place
@@ -255,6 +270,7 @@ def check_rows(measurements: Measurements) -> None:
 
 Told = tuple[Outcome, Floats | None, Floats | None]
 """Outcome of a detection, with innovation (2,) and its covariance (2, 2) where there was a prediction."""
+NO_VIEWS = np.empty((0, 2)), np.empty((0, 2, 2))
 NOT_STARTED, LONG_AGO = int(np.iinfo(np.int64).max), int(np.iinfo(np.int64).min)
 NO_BIAS, NO_RATE = np.zeros(3), np.zeros(3)
 KEPT_NS = 10_000_000_000
@@ -313,7 +329,7 @@ class FilterShell(ABC):
 
     @abstractmethod
     def observe(
-        self, motion: Motion, slot: int, z: View, R_z: Floats, *, may_be_far: bool
+        self, motion: Motion, slot: int, z: Floats, R_z: Floats, *, may_be_far: bool
     ) -> tuple[bool, Floats, Floats]:
         """Update by range and azimuth of a known landmark, a motion after the state, where the gate admits it.
 
@@ -322,7 +338,7 @@ class FilterShell(ABC):
         """
 
     @abstractmethod
-    def augment(self, motion: Motion, z: View, R_z: Floats) -> None:
+    def augment(self, motion: Motion, z: Floats, R_z: Floats) -> None:
         """Append a landmark seen for the first time, a motion after the state."""
 
     @abstractmethod
@@ -447,7 +463,7 @@ class FilterShell(ABC):
             happening += [(t, DEPTH, row) for row, t in enumerate(depth.stamps_ns.tolist()) if t >= since_ns]
         z, R_z = NO_VIEWS
         if detections is not None and frames:
-            z = list(zip(detections.range_m.tolist(), detections.azimuth_rad.tolist(), strict=True))
+            z = np.array((detections.range_m, detections.azimuth_rad)).T.copy()
             R_z = self.sonar.noise_of(detections)
             happening += [(stamp_ns, FRAME, stamp_ns) for stamp_ns in frames]
         events = in_order(happening, self.node_ns, self._opened_ns, self._interval_ns)
@@ -521,7 +537,7 @@ class FilterShell(ABC):
         self._opened_ns, self._opened_velocity = event.end_ns, (velocity_j, variance_j)
         self._opened_R = self.attitude()
 
-    def _see(self, landmark_id: int, motion: Motion, z: View, R_z: Floats) -> Told:
+    def _see(self, landmark_id: int, motion: Motion, z: Floats, R_z: Floats) -> Told:
         """Update by a detection of a landmark, or append the landmark at first sight."""
         if landmark_id not in self._slots:
             self.augment(motion, z, R_z)

@@ -38,12 +38,11 @@ Every H is zero along a shift of everything in x and y and a turn about the vert
 unobservable directions stay unobservable. Derivation: docs/theory/invariant_ekf.md.
 """
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from baselines.filter import Motion, SonarModel
+from baselines.filter import Motion, SonarModel, correction
 from sonar_graph.measurements import Floats
 from sonar_graph.numerics import compiled
 from sonar_graph.numerics.matrices import exp_and_mean, store, vec
@@ -207,37 +206,6 @@ def innovation_covariance(state: InvariantState, H: Floats, noise: Floats) -> tu
 def correct(state: InvariantState, HP: Floats, S: Floats, e: Floats) -> None:
     """Update by an innovation e: ``xi = K e`` with ``K = P H^T S^-1``, ``P <- P - K S K^T``, estimate moved by (1)."""
     retract(state, correction(state.P, HP, S, e))
-
-
-@compiled
-def correction(P: Floats, U: Floats, S: Floats, e: Floats) -> Floats:
-    """``K e`` (n,) of an update by m numbers, ``K = U^T S^-1`` with ``U = H P`` (m, n); P becomes ``P - K S K^T``.
-
-    With ``S = L L^T`` and ``V = L^-1 U`` that is ``P - V^T V``, row by row. Both factors of every product commute, so
-    that P stays symmetric to the last bit. Raises LinAlgError where S is not positive definite.
-    """
-    n, L, V, y, moved = U.shape[1], S.copy(), U.copy(), e.copy(), np.zeros(U.shape[1])
-    for r in range(len(e)):
-        for c in range(r):
-            L[r, r] -= L[r, c] * L[r, c]
-            y[r] -= L[r, c] * y[c]
-            for i in range(n):
-                V[r, i] -= L[r, c] * V[c, i]
-        if not L[r, r] > 0.0:
-            raise np.linalg.LinAlgError("the covariance of an innovation is not positive definite")
-        L[r, r] = math.sqrt(L[r, r])
-        for k in range(r + 1, len(e)):
-            for c in range(r):
-                L[k, r] -= L[k, c] * L[r, c]
-            L[k, r] /= L[r, r]
-        y[r] /= L[r, r]
-        for i in range(n):
-            V[r, i] /= L[r, r]
-        for i in range(n):
-            moved[i] += V[r, i] * y[r]
-            for j in range(n):
-                P[i, j] -= V[r, i] * V[r, j]
-    return moved
 
 
 def augmented(state: InvariantState, x: Floats, G: Floats, noise: Floats) -> InvariantState:

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from baselines import ekf_equations, invariant_equations
-from baselines.filter import SonarModel
+from baselines.filter import SonarModel, correction
 from sonar_graph.calibration import PlanarMotion, Start
 from sonar_graph.slam.models.sonar_model import locate, range_azimuth
 from sonar_graph.testing import check_derivative
@@ -251,7 +251,7 @@ def test_a_correction_by_many_numbers_is_joseph_s_and_exactly_symmetric(seed, m)
     R = root @ root.T + 1e-3 * np.eye(m)
     U, S = H @ P, H @ P @ H.T + R
     after, K = P.copy(), U.T @ np.linalg.inv(S)
-    assert_allclose(invariant_equations.correction(after, U, S, e), K @ e, atol=1e-12)
+    assert_allclose(correction(after, U, S, e), K @ e, atol=1e-12)
     assert_covariance(after, (np.eye(n) - K @ H) @ P @ (np.eye(n) - K @ H).T + K @ R @ K.T)
 
 
