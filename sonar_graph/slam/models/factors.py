@@ -158,35 +158,22 @@ def odometry_with_bias(key_i: int, key_j: int, bias_key: int, motion: Preintegra
 
     Error ``Log(corrected(b)^-1 X_i^-1 X_j)``, shape (6,), with ``corrected(b) = i_T_j Exp(D_bias (b - bias))``.
     """
-    keys = [key_i, key_j, bias_key]
     inverse_mean = motion.i_T_j.inverse()
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:
         X_i, X_j = values.atPose3(key_i), values.atPose3(key_j)
-        return odometry_error(X_i, X_j, values.atPoint3(bias_key), motion, inverse_mean, jacobians)
+        correction = motion.D_bias @ (values.atPoint3(bias_key) - motion.bias)
+        E = gtsam.Pose3.Expmap(-correction).compose(inverse_mean).compose(X_i.between(X_j))
+        e = gtsam.Pose3.Logmap(E)
+        if jacobians is not None:
+            D_log = gtsam.Pose3.LogmapDerivative(e)
+            jacobians[0] = -D_log @ X_j.between(X_i).AdjointMap()
+            jacobians[1] = D_log
+            D_exp = gtsam.Pose3.ExpmapDerivative(correction)
+            jacobians[2] = -D_log @ E.inverse().AdjointMap() @ D_exp @ motion.D_bias
+        return e
 
-    return gtsam.CustomFactor(gaussian(motion.covariance), keys, error)
-
-
-def odometry_error(
-    X_i: gtsam.Pose3,
-    X_j: gtsam.Pose3,
-    bias: Floats,
-    motion: PreintegratedMotion,
-    inverse_mean: gtsam.Pose3,
-    jacobians: list[Floats] | None = None,
-) -> Floats:
-    """Error of `odometry_with_bias`, shape (6,); fills the derivatives by X_i (6, 6), X_j (6, 6), bias (6, 3)."""
-    correction = motion.D_bias @ (bias - motion.bias)
-    E = gtsam.Pose3.Expmap(-correction).compose(inverse_mean).compose(X_i.between(X_j))
-    error = gtsam.Pose3.Logmap(E)
-    if jacobians is not None:
-        D_log = gtsam.Pose3.LogmapDerivative(error)
-        E_inverse = E.inverse()
-        jacobians[0] = -D_log @ X_j.between(X_i).AdjointMap()
-        jacobians[1] = D_log
-        jacobians[2] = -D_log @ E_inverse.AdjointMap() @ gtsam.Pose3.ExpmapDerivative(correction) @ motion.D_bias
-    return error
+    return gtsam.CustomFactor(gaussian(motion.covariance), [key_i, key_j, bias_key], error)
 
 
 def landmark_sighting(

@@ -25,6 +25,7 @@ be estimated, `sonar_graph.slam.models.factors.odometry` makes of ``motion.relat
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Floats
@@ -33,19 +34,18 @@ from sonar_graph.navigation.preintegration import DISPLACEMENT, ROTATION, JointM
 from sonar_graph.numerics import compiled, left_jacobian, rotation_exp, skew
 from sonar_graph.slam.models.factors import gaussian
 
-NO_MOUNTING = np.zeros(3)
 BIAS_ORDER = np.r_[3:6, 0:3]
 """GTSAM's bias has the accelerometers first."""
 DOPPLER_ROWS = np.r_[ROTATION, DISPLACEMENT]
-POSE_I, VELOCITY_I, POSE_J, VELOCITY_J, BIAS, SCALE, MOUNTING = (
-    slice(0, 6),
-    slice(6, 9),
-    slice(9, 15),
-    slice(15, 18),
-    slice(18, 24),
-    slice(24, 25),
-    slice(25, 28),
-)
+COLUMNS = {
+    "pose_i": slice(0, 6),
+    "velocity_i": slice(6, 9),
+    "pose_j": slice(9, 15),
+    "velocity_j": slice(15, 18),
+    "bias": slice(18, 24),
+    "scale": slice(24, 25),
+    "mounting": slice(25, 28),
+}
 """Columns of the derivatives of `joint_error`."""
 
 
@@ -77,97 +77,63 @@ def inertial_doppler_odometry(
         When gravity is no vector, a key is given twice or is no integer, or the motion's specific force was not
         measured.
     """
-    keys = [pose_i, velocity_i, pose_j, velocity_j, bias]
-    columns = [POSE_I, VELOCITY_I, POSE_J, VELOCITY_J, BIAS]
-    keys, columns = _with_calibration(keys, columns, scale, mounting)
-    terms = _Terms(motion, finite_vector("gravity", gravity, 3))
     if not np.isfinite(motion.velocity).all():
         raise MeasurementError(
             f"motion: from {motion.start_ns} to {motion.end_ns} ns the specific force was not measured in every row;"
             " use doppler_odometry"
         )
-
-    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:
-        speeds = values.atPoint3(velocity_i), values.atPoint3(velocity_j)
-        e, H = terms.at(values, pose_i, pose_j, bias, scale, mounting, *speeds)
-        if jacobians is not None:
-            for n, column in enumerate(columns):
-                jacobians[n] = H[:, column]
-        return e
-
-    return gtsam.CustomFactor(gaussian(motion.covariance), keys, error)
+    ends = {"pose_i": pose_i, "velocity_i": velocity_i, "pose_j": pose_j, "velocity_j": velocity_j}
+    keys = {**ends, "bias": bias, "scale": scale, "mounting": mounting}
+    return _factor(keys, motion, finite_vector("gravity", gravity, 3), np.arange(12))
 
 
 def doppler_odometry(
     pose_i: int, pose_j: int, bias: int, motion: JointMotion, scale: int | None = None, mounting: int | None = None
 ) -> gtsam.NonlinearFactor:
     """Six rows from gyro and Doppler log; see `inertial_doppler_odometry`."""
-    keys, columns = _with_calibration([pose_i, pose_j, bias], [POSE_I, POSE_J, BIAS], scale, mounting)
-    terms, at_rest = _Terms(motion, np.zeros(3)), np.zeros(3)
-
-    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:
-        e, H = terms.at(values, pose_i, pose_j, bias, scale, mounting, at_rest, at_rest)
-        if jacobians is not None:
-            for n, column in enumerate(columns):
-                jacobians[n] = H[DOPPLER_ROWS, column]
-        return e[DOPPLER_ROWS]
-
-    cov = motion.covariance[np.ix_(DOPPLER_ROWS, DOPPLER_ROWS)]
-    return gtsam.CustomFactor(gaussian(cov), keys, error)
+    keys = {"pose_i": pose_i, "pose_j": pose_j, "bias": bias, "scale": scale, "mounting": mounting}
+    return _factor(keys, motion, np.zeros(3), DOPPLER_ROWS)
 
 
-def _with_calibration(
-    keys: list[int], columns: list[slice], scale: int | None, mounting: int | None
-) -> tuple[list[int], list[slice]]:
-    """The keys and columns with those of the calibration that is estimated."""
-    extra = [(key, column) for key, column in ((scale, SCALE), (mounting, MOUNTING)) if key is not None]
-    keys = [*keys, *(key for key, _ in extra)]
-    for key in keys:
+def _factor(
+    given: dict[str, int | None], motion: JointMotion, gravity: Floats, rows: NDArray[np.intp]
+) -> gtsam.NonlinearFactor:
+    """Rows of `joint_error` as a factor of the variables that have a key."""
+    keys = {name: key for name, key in given.items() if key is not None}
+    for key in keys.values():
         if not isinstance(key, int | np.integer):
             raise MeasurementError(f"keys: expected integers, such as gtsam.symbol('x', 0), not {key!r}")
-        if keys.count(key) > 1:
+        if list(keys.values()).count(key) > 1:
             raise MeasurementError(
                 f"keys: {gtsam.DefaultKeyFormatter(key)} is given twice; each variable needs its own"
             )
-    return keys, [*columns, *(column for _, column in extra)]
+    constants = (
+        motion.i_R_j.matrix(),
+        np.array([motion.velocity, motion.position, motion.displacement]),
+        np.ascontiguousarray(motion.D_parameters),
+        motion.bias,
+        motion.body_p_imu,
+        motion.body_p_dvl,
+        np.asarray(gravity, np.float64),
+        motion.duration_s,
+    )
 
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:
+        parameters, at_rest = np.zeros(10), np.zeros(3)
+        parameters[:6] = values.atConstantBias(keys["bias"]).vector()[BIAS_ORDER]
+        if "scale" in keys:
+            parameters[6] = values.atDouble(keys["scale"])
+        if "mounting" in keys:
+            parameters[7:] = values.atPoint3(keys["mounting"])
+        X_i, X_j = (values.atPose3(keys[name]).matrix() for name in ("pose_i", "pose_j"))
+        v_i, v_j = (values.atPoint3(keys[n]) if n in keys else at_rest for n in ("velocity_i", "velocity_j"))
+        e, H = joint_error(X_i, v_i, X_j, v_j, parameters, *constants)
+        if jacobians is not None:
+            for n, name in enumerate(keys):
+                jacobians[n] = H[rows, COLUMNS[name]]
+        return e[rows]
 
-class _Terms:
-    """Arguments of an error that come from the motion, as contiguous arrays."""
-
-    def __init__(self, motion: JointMotion, gravity: Floats) -> None:
-        measured = motion.velocity, motion.position, motion.displacement
-        self._constants = (
-            motion.i_R_j.matrix(),
-            np.array(measured),
-            np.ascontiguousarray(motion.D_parameters),
-            motion.bias,
-            motion.body_p_imu,
-            motion.body_p_dvl,
-            np.asarray(gravity, np.float64),
-            motion.duration_s,
-        )
-
-    def at(
-        self,
-        values: gtsam.Values,
-        pose_i: int,
-        pose_j: int,
-        bias: int,
-        scale: int | None,
-        mounting: int | None,
-        velocity_i: Floats,
-        velocity_j: Floats,
-    ) -> tuple[Floats, Floats]:
-        """Error (12,) and derivatives (12, 28) at the values of the keys."""
-        parameters = np.zeros(10)
-        parameters[:6] = values.atConstantBias(bias).vector()[BIAS_ORDER]
-        if scale is not None:
-            parameters[6] = values.atDouble(scale)
-        if mounting is not None:
-            parameters[7:] = values.atPoint3(mounting)
-        X_i, X_j = values.atPose3(pose_i).matrix(), values.atPose3(pose_j).matrix()
-        return joint_error(X_i, velocity_i, X_j, velocity_j, parameters, *self._constants)
+    return gtsam.CustomFactor(gaussian(motion.covariance[np.ix_(rows, rows)]), list(keys.values()), error)
 
 
 @compiled
