@@ -84,7 +84,8 @@ if TYPE_CHECKING:
     from sonar_graph.estimator import Estimator, load_estimator
     from sonar_graph.evaluation import Comparison, RunResult, compare, run_estimator
     from sonar_graph.logs import inspect_log, read_log, write_log
-    from sonar_graph.measurements import Depth, Dvl, Imu, LandmarkDetections, Measurements, SonarFrames
+    from sonar_graph.images import SonarFrames
+    from sonar_graph.measurements import Depth, Dvl, Imu, LandmarkDetections, Measurements
     from sonar_graph.navigation import Odometry
     from sonar_graph.recognition import recognise
     from sonar_graph.report import write_report

@@ -53,32 +53,6 @@ class Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
 
-def tagged(tag: str, default: str) -> tuple[FieldInfo, BeforeValidator]:
-    """Metadata of a union of sections that one of their fields tells apart; it has a default.
-
-    ``tag``: that field, with a literal text in each section; ``default``: its value where it is not given.
-    """
-
-    def with_tag(value: Any) -> Any:
-        if isinstance(value, str):
-            raise ValueError(f'expected a section with {tag} = "{value}"')
-        return {tag: default, **value} if isinstance(value, dict) else value
-
-    return Field(discriminator=tag), BeforeValidator(with_tag)
-
-
-def misfits(model: type[BaseModel], reasons: dict[str, str]) -> ValidationError:
-    """Error for a model's validator to raise where fields exclude each other.
-
-    ``reasons``: message for each field, so that the line in a file can be named.
-    """
-    found = [
-        InitErrorDetails(type=PydanticCustomError(MISFIT, "{reason}", {"reason": reason}), loc=(name,), input=None)
-        for name, reason in reasons.items()
-    ]
-    return ValidationError.from_exception_data(model.__name__, found)
-
-
 class Mounting(Section):
     """Where a sensor sits on the body: ``body_T_sensor``."""
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.devices import DEFAULT_DESIGNS
-from sonar_graph.measurements import SonarFrames
+from sonar_graph.images import SonarFrames
 from sonar_graph.simulation.sonar_image import FrameSimulator, ImageOptions, place_landmark
 from sonar_graph.sonar import FloorView, Recogniser, SonarStep
 

@@ -47,7 +47,8 @@ from sonar_graph.logs.vehicle_setup import (
     recorded_name,
     static_frames,
 )
-from sonar_graph.measurements import Block, Depth, Dvl, Floats, Imu, LandmarkDetections, SonarFrames
+from sonar_graph.images import SonarFrames
+from sonar_graph.measurements import Block, Depth, Dvl, Floats, Imu, LandmarkDetections
 from sonar_graph.sequence import Sequence
 
 FOUND_ANEW = frozenset({"log.warnings", "log.gaps", "log.noise"})

@@ -17,7 +17,8 @@ import numpy as np
 from gtsam.symbol_shorthand import L
 from pydantic import model_validator
 
-from sonar_graph.calibration import Calibration, Section, misfits
+from sonar_graph.calibration import Calibration, Section
+from sonar_graph.tagged_sections import misfits
 from sonar_graph.errors import CalibrationError, EstimatorError
 from sonar_graph.measurements import NS_PER_S, Floats, Ints, Measurements
 from sonar_graph.motion import MotionSource

@@ -21,7 +21,8 @@ from pydantic import Field
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.devices import LandmarkDesign
 from sonar_graph.errors import CalibrationError
-from sonar_graph.measurements import Floats, LandmarkDetections, SonarFrames
+from sonar_graph.images import SonarFrames
+from sonar_graph.measurements import Floats, LandmarkDetections
 from sonar_graph.sonar.frame_check import FrameCheck, check_block
 from sonar_graph.sonar.geometry import FloorView, points
 from sonar_graph.sonar.recogniser import REPORTED, Fate

@@ -14,7 +14,8 @@ from pydantic import Field
 
 from sonar_graph.calibration import Section
 from sonar_graph.devices import LandmarkDesign
-from sonar_graph.measurements import Floats, Ints, SonarFrames
+from sonar_graph.images import SonarFrames
+from sonar_graph.measurements import Floats, Ints
 from sonar_graph.numerics import compiled
 from sonar_graph.sonar.confusion import Confusion, soft_scores
 from sonar_graph.sonar.geometry import FloorView

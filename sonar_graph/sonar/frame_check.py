@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from sonar_graph.calibration import SonarImage
 from sonar_graph.errors import MeasurementError
-from sonar_graph.measurements import Floats, SonarFrames
+from sonar_graph.images import SonarFrames
+from sonar_graph.measurements import Floats
 
 SATURATED_SHARE = 0.5
 """Share of samples at the largest value from which on a frame is saturated."""

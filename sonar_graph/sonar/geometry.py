@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from sonar_graph.devices import DIDSON_BEAMS, aris_azimuths, didson_azimuths
 from sonar_graph.errors import CalibrationError
-from sonar_graph.measurements import Floats, SonarFrames
+from sonar_graph.images import SonarFrames
+from sonar_graph.measurements import Floats
 from sonar_graph.numerics import compiled
 
 

@@ -16,7 +16,8 @@ from scipy.optimize import linear_sum_assignment
 
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.devices import DEFAULT_DESIGNS, LandmarkDesign
-from sonar_graph.measurements import Floats, Ints, LandmarkDetections, SonarFrames
+from sonar_graph.images import SonarFrames
+from sonar_graph.measurements import Floats, Ints, LandmarkDetections
 from sonar_graph.sonar.appearance import Appearance, AppearanceParams, CandidateFit, ObjectSighting
 from sonar_graph.sonar.bayes import Beliefs, IdentityParams
 from sonar_graph.sonar.cfar import DetectionParams, check_candidates, select_candidates

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import CalibrationError, MeasurementError
-from sonar_graph.measurements import SonarFrames
+from sonar_graph.images import SonarFrames
 from sonar_graph.simulation.sonar_image.frames import FrameSimulator
 from sonar_graph.simulation.sonar_image.imaging_sonar import DIDSON, ImageOptions
 from sonar_graph.simulation.sonar_image.scene import place_landmark

@@ -5,7 +5,8 @@ import pytest
 from scipy.special import erf
 
 from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
-from sonar_graph.measurements import Floats, SonarFrames
+from sonar_graph.images import SonarFrames
+from sonar_graph.measurements import Floats
 from sonar_graph.sonar.appearance import CENTROID_SIGMA_M, Appearance, CandidateFit, DesignFit, ObjectSighting
 from sonar_graph.sonar.confusion import Confusion, confusion_for, soft_scores
 from sonar_graph.sonar.geometry import FloorView

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sonar_graph.calibration import SonarImage
-from sonar_graph.measurements import SonarFrames
+from sonar_graph.images import SonarFrames
 from sonar_graph.sonar.frame_check import FrameCheck
 
 BEAMS, BINS = 10, 40

@@ -5,7 +5,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from sonar_graph.errors import CalibrationError
-from sonar_graph.measurements import Floats, SonarFrames
+from sonar_graph.images import SonarFrames
+from sonar_graph.measurements import Floats
 from sonar_graph.simulation.sonar_image.imaging_sonar import DIDSON
 from sonar_graph.sonar.geometry import Fan, FloorView, point_covariances, points, ranges_azimuths_elevations, with_lens
 

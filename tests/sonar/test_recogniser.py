@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from sonar_graph.calibration import Calibration, SonarCalibration, SonarImage
 from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS
 from sonar_graph.errors import CalibrationError, MeasurementError
-from sonar_graph.measurements import Floats, SonarFrames
+from sonar_graph.images import SonarFrames
+from sonar_graph.measurements import Floats
 from sonar_graph.sonar import recogniser as module
 from sonar_graph.sonar.bayes import IdentityParams
 from sonar_graph.sonar.cfar import DetectionParams

@@ -25,7 +25,8 @@ from sonar_graph.errors import DatasetError
 from sonar_graph.logs.mcap import Progress, recording
 from sonar_graph.logs.vehicle_setup import METADATA
 from sonar_graph.logs.writing import sonar_image_messages
-from sonar_graph.measurements import Floats, SonarFrames
+from sonar_graph.images import SonarFrames
+from sonar_graph.measurements import Floats
 
 TOPIC = "/sonar/image"
 _SEARCH_BYTES = 1 << 20

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Mounting
-from sonar_graph.measurements import NS_PER_S, Floats, Ints, SonarFrames
+from sonar_graph.images import SonarFrames
+from sonar_graph.measurements import NS_PER_S, Floats, Ints
 from sonar_graph.simulation.detections import FieldOfView, inside, range_azimuth_elevation
 from sonar_graph.simulation.sensors import body_R_sensor, seconds_since_start
 from sonar_graph.simulation.sonar_image import echoes

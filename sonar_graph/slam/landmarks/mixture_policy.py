@@ -19,7 +19,7 @@ import numpy as np
 from gtsam.symbol_shorthand import L
 from pydantic import Field
 
-from sonar_graph.calibration import tagged
+from sonar_graph.tagged_sections import tagged
 from sonar_graph.measurements import NO_TRACK, Floats
 from sonar_graph.slam.landmarks.association import IdentityPosterior, RecogniserErrors
 from sonar_graph.slam.landmarks.mixture import Choices, Mixture, TrackedObject, each_once, supporters_elsewhere

@@ -26,7 +26,8 @@ from gtsam.symbol_shorthand import L
 from numpy.typing import NDArray
 from pydantic import Field
 
-from sonar_graph.calibration import Section, tagged
+from sonar_graph.calibration import Section
+from sonar_graph.tagged_sections import tagged
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats, LandmarkDetections
 from sonar_graph.slam.landmarks.association import gate_threshold

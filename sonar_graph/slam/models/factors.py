@@ -25,7 +25,8 @@ import numpy as np
 from pydantic import Field
 from scipy.integrate import quad
 
-from sonar_graph.calibration import Calibration, PlanarMotion, Section, tagged
+from sonar_graph.calibration import Calibration, PlanarMotion, Section
+from sonar_graph.tagged_sections import tagged
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Floats
 from sonar_graph.navigation import PreintegratedMotion

@@ -21,7 +21,8 @@ import gtsam
 import numpy as np
 from pydantic import Field
 
-from sonar_graph.calibration import Section, tagged
+from sonar_graph.calibration import Section
+from sonar_graph.tagged_sections import tagged
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats
 from sonar_graph.slam.smoother.batch_solution import (

@@ -17,7 +17,7 @@ from sonar_graph.logs.mcap.reader import Recording, scan
 from sonar_graph.logs.mcap.topic import Keep
 from sonar_graph.logs.reading import read_sonar_frames
 from sonar_graph.logs.vehicle_setup import read_calibration, read_notes
-from sonar_graph.measurements import SonarFrames
+from sonar_graph.images import SonarFrames
 
 START = datetime(2014, 5, 6, 7, 8, 9, 250_000, tzinfo=UTC)
 STEP = timedelta(milliseconds=120)

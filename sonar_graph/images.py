@@ -1,0 +1,58 @@
+"""Images of an imaging sonar, as recorded: what the recogniser sees and no estimator does."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sonar_graph.errors import MeasurementError
+from sonar_graph.measurements import Floats, Ints
+
+
+@dataclass(frozen=True, eq=False)
+class SonarFrames:
+    """Polar images of an imaging sonar, as recorded; frames of one block share their beams and range bins.
+
+    ``intensity[i, b, r]`` is the sample of frame i in the beam at ``azimuths_rad[b]`` and the bin at ``ranges_m[r]``.
+    ``calibration.sonar.image`` says whether samples are decibels or amplitudes, and their full scale. A single frame
+    is a block with n = 1: ``image[None]``.
+
+    Raises
+    ------
+    MeasurementError
+        When there is no frame, or the shapes do not belong together.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> frames = SonarFrames(
+    ...     stamps_ns=np.array([0]),
+    ...     intensity=np.zeros((1, 96, 512), np.uint8),
+    ...     ranges_m=np.linspace(1.26, 2.51, 512),
+    ...     azimuths_rad=np.linspace(0.25, -0.25, 96),
+    ... )
+    >>> len(frames)
+    1
+    """
+
+    stamps_ns: Ints
+    """Time at which each ping was sent, shape (n,), integer nanoseconds, not decreasing."""
+    intensity: NDArray[Any]
+    """Shape (n, beams, bins), in the sonar's own type and scale."""
+    ranges_m: Floats
+    """Middle of each range bin, shape (bins,)."""
+    azimuths_rad: Floats
+    """Azimuth of each beam, ``atan2(y, x)`` in the sonar frame, positive to the left, shape (beams,)."""
+
+    def __post_init__(self) -> None:
+        expected = (len(self.stamps_ns), len(self.azimuths_rad), len(self.ranges_m))
+        if self.intensity.shape != expected or 0 in expected:
+            raise MeasurementError(
+                f"SonarFrames.intensity: shape {self.intensity.shape}; stamps, beams and bins are {expected}"
+            )
+        if np.any(self.stamps_ns[1:] < self.stamps_ns[:-1]):
+            raise MeasurementError("SonarFrames: stamps run backwards; sort the frames by stamp")
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
