@@ -11,11 +11,7 @@ from typing import Annotated, Any, Literal
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
-from pydantic.fields import FieldInfo
-from pydantic_core import InitErrorDetails, PydanticCustomError
-
-from sonar_graph.errors import MISFIT
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 STANDARD_GRAVITY = 9.80665
 HOLE_INTERVALS = 5

@@ -12,12 +12,12 @@ from pathlib import Path
 import pytest
 from numba.core import event
 
-from sonar_graph.numerics import jit
+from sonar_graph.numerics import compiling
 
 KERNELS = """
 from sonar_graph.numerics import compiled, jit
 
-jit._compiled_in.clear()
+jit.COMPILED_IN.clear()
 
 @compiled
 def twice(x):
@@ -45,16 +45,16 @@ def loops(tmp_path: Path) -> Path:
 
 
 def test_the_first_compilation_is_told_once_and_later_ones_are_not(loops):
-    assert told(loops) == f"{jit.NOTICE}\n"
+    assert told(loops) == f"{compiling.NOTICE}\n"
     assert told(loops) == ""
     assert told(loops, "import loops; assert loops.thrice(1.5) == 4.5") == ""  # compiled, but not the first time
 
 
 def test_a_long_wait_is_told_with_what_is_compiled_and_how_far_it_is(loops):
-    program = f"from sonar_graph.numerics import jit; jit.TELL_EVERY_S = 0.0; {CALLS}"
+    program = f"from sonar_graph.numerics import compiling; compiling.TELL_EVERY_S = 0.0; {CALLS}"
     lines = ("twice (1 of about 2)", "thrice (2 of about 2)", "twice (3 of about 3)")
     assert told(loops, program) == "\n".join(
-        [jit.NOTICE, *(f"compiling for the first use: {line}" for line in lines), ""]
+        [compiling.NOTICE, *(f"compiling for the first use: {line}" for line in lines), ""]
     )
 
 
@@ -66,7 +66,7 @@ def test_a_terminal_shows_what_is_compiled_in_place_and_nothing_stays(loops):
     os.write(terminal, b"end")
     assert os.read(reader, 10_000) == b"end"  # from the cache: nothing
     head, *lines = shown.split(ERASED)
-    assert head == f"{jit.NOTICE}\r\n"
+    assert head == f"{compiling.NOTICE}\r\n"
     assert lines[0] == "compiling for the first use: twice (1 of about 2)"
     assert lines[-1] == ""
 

@@ -46,8 +46,8 @@ os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
 import cv2
 import numpy as np
 
-from sonar_graph.logs import read_log, read_sonar_frames, sonar_image_messages, write_log
 from sonar_graph.images import SonarFrames
+from sonar_graph.logs import read_log, read_sonar_frames, sonar_image_messages, write_log
 from sonar_graph.recognition import recognise_images
 from sonar_graph.recognition.session import one_by_one
 from sonar_graph.recognition.sonar_motion import SonarMotions

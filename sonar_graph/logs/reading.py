@@ -14,6 +14,7 @@ import numpy as np
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import LogError
 from sonar_graph.files import as_path
+from sonar_graph.images import SonarFrames
 from sonar_graph.logs.adapters import (
     DepthAdapter,
     Dropped,
@@ -47,7 +48,6 @@ from sonar_graph.logs.vehicle_setup import (
     recorded_name,
     static_frames,
 )
-from sonar_graph.images import SonarFrames
 from sonar_graph.measurements import Block, Depth, Dvl, Floats, Imu, LandmarkDetections
 from sonar_graph.sequence import Sequence
 

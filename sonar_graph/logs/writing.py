@@ -14,12 +14,12 @@ import numpy as np
 
 from sonar_graph.errors import LogError
 from sonar_graph.files import as_path
+from sonar_graph.images import SonarFrames
 from sonar_graph.logs.adapters import SAMPLE_TYPES, body_to_ros
 from sonar_graph.logs.cdr import Bytes, Struct, Value, definition, encode, parse_definition
 from sonar_graph.logs.mcap import Outgoing, recording
 from sonar_graph.logs.roles import DETECTIONS, DVL, IMU, LANDMARK_MAP, ODOMETRY, POSE_WITH_COVARIANCE, SONAR_IMAGE, TF
 from sonar_graph.logs.vehicle_setup import BODY_FRAME, METADATA, encode_mountings
-from sonar_graph.images import SonarFrames
 from sonar_graph.measurements import NO_TRACK, NS_PER_S, Depth, Dvl, Floats, Imu, Ints, LandmarkDetections
 from sonar_graph.sequence import Sequence, require_sequence
 from sonar_graph.states import LandmarkMap, Trajectory

@@ -1,7 +1,8 @@
 """Compiled functions, and vectors and matrices of three rows inside them."""
 
 # fmt: off
-from sonar_graph.numerics.jit import compiled, compiling_s, inlined
+from sonar_graph.numerics.compiling import compiling_s
+from sonar_graph.numerics.jit import compiled, inlined
 from sonar_graph.numerics.mat3 import (
     IDENTITY, ZERO, ZEROS, Matrix, Vector, cross, difference_of, dot, euler_from_rates, euler_from_rotation, gram,
     left_jacobian, matrix, minus, multiple_of, place, plus, product, rates_from_euler, rotation_exp,

@@ -16,10 +16,10 @@ import numpy as np
 from sonar_graph.calibration import Calibration
 from sonar_graph.devices import LandmarkDesign
 from sonar_graph.errors import LogError, MeasurementError
+from sonar_graph.images import SonarFrames
 from sonar_graph.logs import PartialCalibration, read_log, read_sonar_frames
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.logs.mcap import TimeWindow
-from sonar_graph.images import SonarFrames
 from sonar_graph.measurements import NS_PER_S, LandmarkDetections
 from sonar_graph.recognition.recognition_record import DrawnFrame, Recognition, as_jpeg, draw_fan
 from sonar_graph.recognition.sonar_motion import SonarMotions

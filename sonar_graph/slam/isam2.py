@@ -18,7 +18,6 @@ from gtsam.symbol_shorthand import L
 from pydantic import model_validator
 
 from sonar_graph.calibration import Calibration, Section
-from sonar_graph.tagged_sections import misfits
 from sonar_graph.errors import CalibrationError, EstimatorError
 from sonar_graph.measurements import NS_PER_S, Floats, Ints, Measurements
 from sonar_graph.motion import MotionSource
@@ -29,6 +28,7 @@ from sonar_graph.slam.landmarks import IdentityParams, MixtureIdentity, RobustId
 from sonar_graph.slam.models import KernelParams, RobustKernel
 from sonar_graph.slam.smoother import HistoryParams, JointCovariance, Smoother, SmootherParams, WholeHistory
 from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, RefusedRow, Trajectory
+from sonar_graph.tagged_sections import misfits
 
 
 class Isam2Params(Section):

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from sonar_graph.errors import LogError, MissingTopicError
+from sonar_graph.images import SonarFrames
 from sonar_graph.logs.mcap.file_summary import Instant, TimeWindow
 from sonar_graph.logs.reading import read_log
 from sonar_graph.logs.writing import sonar_image_messages, write_log
-from sonar_graph.images import SonarFrames
 from sonar_graph.recognition.recognition_record import Recognition
 from sonar_graph.recognition.session import LEAPT, NO_FLOOR, recognise_images
 from tests.recognition.imaged_lane import TOPIC, Lane

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS
+from sonar_graph.images import SonarFrames
 from sonar_graph.logs.mcap.writer import Outgoing
 from sonar_graph.logs.writing import sonar_image_messages, write_log
-from sonar_graph.images import SonarFrames
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.basin import BODY_Z_M, FLOOR_Z_M, YSHARK
 from sonar_graph.simulation.detections import world_on_floor

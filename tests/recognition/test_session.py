@@ -9,9 +9,9 @@ import pytest
 from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.errors import LogError, MeasurementError
 from sonar_graph.evaluation.comparison import compare
+from sonar_graph.images import SonarFrames
 from sonar_graph.logs.reading import read_log
 from sonar_graph.logs.writing import write_log
-from sonar_graph.images import SonarFrames
 from sonar_graph.measurements import Floats, Ints, LandmarkDetections
 from sonar_graph.recognition.recognition_record import Recognition
 from sonar_graph.recognition.session import RecognitionSession, one_by_one, recognise, recognise_images, with_detections

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from sonar_graph.images import SonarFrames
 from sonar_graph.logs.adapters.adapter import Adapter, field_paths
 from sonar_graph.logs.adapters.message_table import MessageTable
 from sonar_graph.logs.cdr import Messages
 from sonar_graph.logs.mcap import Topic
-from sonar_graph.images import SonarFrames
 from sonar_graph.measurements import Floats, Ints
 
 SAMPLE_TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")

@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 
 from sonar_graph.calibration import Calibration, SonarCalibration, SonarImage
 from sonar_graph.errors import DatasetError
+from sonar_graph.images import SonarFrames
 from sonar_graph.logs.mcap import Progress, recording
 from sonar_graph.logs.vehicle_setup import METADATA
 from sonar_graph.logs.writing import sonar_image_messages
-from sonar_graph.images import SonarFrames
 from sonar_graph.measurements import Floats
 
 TOPIC = "/sonar/image"

@@ -19,7 +19,6 @@ import numpy as np
 from gtsam.symbol_shorthand import L
 from pydantic import Field
 
-from sonar_graph.tagged_sections import tagged
 from sonar_graph.measurements import NO_TRACK, Floats
 from sonar_graph.slam.landmarks.association import IdentityPosterior, RecogniserErrors
 from sonar_graph.slam.landmarks.mixture import Choices, Mixture, TrackedObject, each_once, supporters_elsewhere
@@ -28,6 +27,7 @@ from sonar_graph.slam.landmarks.sighting import LandmarkSightings, Sighting
 from sonar_graph.slam.landmarks.tracked import NS_PER_S, STILL, GatedIdentity, RobustIdentity
 from sonar_graph.slam.models import PredictedView
 from sonar_graph.states import DetectionJournal, DetectionLog, Outcome
+from sonar_graph.tagged_sections import tagged
 
 MOST_ROUNDS = 3
 """Times that choices are made anew after one update."""

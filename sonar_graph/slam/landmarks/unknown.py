@@ -27,7 +27,6 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from sonar_graph.calibration import Section
-from sonar_graph.tagged_sections import tagged
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats, LandmarkDetections
 from sonar_graph.slam.landmarks.association import gate_threshold
@@ -36,6 +35,7 @@ from sonar_graph.slam.landmarks.sighting import LandmarkSightings, Sighting, pla
 from sonar_graph.slam.models import PredictedView, wrap_angle
 from sonar_graph.slam.smoother import JointCovariance
 from sonar_graph.states import FIRST_ANONYMOUS_ID, DetectionJournal, Outcome
+from sonar_graph.tagged_sections import tagged
 
 
 class LandmarkMerging:

@@ -22,7 +22,6 @@ import numpy as np
 from pydantic import Field
 
 from sonar_graph.calibration import Section
-from sonar_graph.tagged_sections import tagged
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats
 from sonar_graph.slam.smoother.batch_solution import (
@@ -35,6 +34,7 @@ from sonar_graph.slam.smoother.batch_solution import (
 from sonar_graph.slam.smoother.factor_store import FactorGroup, Factors, FactorStore, graph_of
 from sonar_graph.slam.smoother.fixed_lag import SmootherWindow, picked, split, with_marginals
 from sonar_graph.slam.smoother.observability import Blame, Withheld, variable_name
+from sonar_graph.tagged_sections import tagged
 
 RESTART_GROWTH = 1.25
 """Number of factors, relative to that at the last restart, before the next one."""

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from sonar_graph.errors import LogError
+from sonar_graph.images import SonarFrames
 from sonar_graph.logs.adapters.log_config import read_log_config
 from sonar_graph.logs.inspection import inspect_log
 from sonar_graph.logs.reading import read_sonar_frames
-from sonar_graph.images import SonarFrames
 from sonar_graph.measurements import Floats
 
 from .conftest import STEP_NS, T0_NS, Entry, dvl, imu, rows_of, vector

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from sonar_graph.images import SonarFrames
 from sonar_graph.logs.convert.didson_aris import convert_aris, convert_didson
 from sonar_graph.logs.convert.oculus import convert_oculus
 from sonar_graph.logs.convert.sonar_file import SonarConversion
@@ -17,7 +18,6 @@ from sonar_graph.logs.mcap.reader import Recording, scan
 from sonar_graph.logs.mcap.topic import Keep
 from sonar_graph.logs.reading import read_sonar_frames
 from sonar_graph.logs.vehicle_setup import read_calibration, read_notes
-from sonar_graph.images import SonarFrames
 
 START = datetime(2014, 5, 6, 7, 8, 9, 250_000, tzinfo=UTC)
 STEP = timedelta(milliseconds=120)

@@ -1,0 +1,79 @@
+"""Progress of compiling, for the user who waits for it, and the time that it takes, which no estimator needs."""
+
+import logging
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from numba.core import event
+
+from sonar_graph.numerics.jit import COMPILED_IN
+
+LOG = logging.getLogger(__name__)
+NOTICE = "compiling for the first use, once: later uses find the code in their cache"
+TELL_EVERY_S = 10.0
+
+
+class _Progress(event.Listener):
+    """Says what is compiled: first in the log, then on a line of the terminal, or every `TELL_EVERY_S` in the log."""
+
+    def __init__(self) -> None:
+        self._depth, self._count, self._told_s = 0, 0, 0.0
+
+    def on_start(self, event: Any) -> None:
+        dispatcher, now_s, terminal = event.data["dispatcher"], time.monotonic(), _terminal()
+        if dispatcher.py_func.__module__ not in COMPILED_IN:
+            return
+        if not self._count:
+            self._told_s = now_s
+            if not any(Path(dispatcher._cache.cache_path).glob("*.nbi")):
+                LOG.warning(NOTICE)
+        self._depth, self._count = self._depth + 1, self._count + 1
+        about = max(self._count, COMPILED_IN.total())
+        line = f"compiling for the first use: {dispatcher.py_func.__name__} ({self._count} of about {about})"
+        if terminal:
+            print(f"\r\x1b[2K{line}", end="", file=terminal, flush=True)
+        elif now_s - self._told_s >= TELL_EVERY_S:
+            self._told_s = now_s
+            LOG.warning(line)
+
+    def on_end(self, event: Any) -> None:
+        if event.data["dispatcher"].py_func.__module__ in COMPILED_IN:
+            self._depth -= 1
+            if not self._depth and (terminal := _terminal()):
+                print("\r\x1b[2K", end="", file=terminal, flush=True)
+
+
+def _terminal() -> Any:
+    """Standard error where a user reads it, not as a progress bar redirects it."""
+    return sys.__stderr__ if sys.__stderr__ and sys.__stderr__.isatty() else None
+
+
+event.register("numba:compile", _Progress())  # type: ignore[no-untyped-call]  # numba has no types
+
+
+class _Stopwatch(event.Listener, threading.local):
+    """Seconds in which a thread compiles, loads what was compiled, or waits for another that does."""
+
+    depth, began_s, total_s = 0, 0.0, 0.0
+
+    def on_start(self, _event: Any) -> None:
+        if not self.depth:
+            self.began_s = time.perf_counter()
+        self.depth += 1
+
+    def on_end(self, _event: Any) -> None:
+        self.depth -= 1
+        if not self.depth:
+            self.total_s += time.perf_counter() - self.began_s
+
+
+_STOPWATCH = _Stopwatch()
+event.register("numba:compiler_lock", _STOPWATCH)  # type: ignore[no-untyped-call]  # numba has no types
+
+
+def compiling_s() -> float:
+    """Seconds that this thread has spent compiling and loading compiled code until now."""
+    return _STOPWATCH.total_s
