@@ -22,7 +22,7 @@ import math
 
 import numpy as np
 
-from baselines.filter import Motion, SonarModel, correction, far_view, polar_covariance
+from baselines.filter import Motion, SonarModel, correction, far_view, is_inside, polar_covariance
 from sonar_graph.measurements import Floats
 from sonar_graph.numerics import compiled, inlined
 from sonar_graph.numerics.matrices import (
@@ -244,6 +244,8 @@ def observe_far(
     view = far_view(missed, U @ H.T + G_b @ motion.C @ G_b.T, G_z, sonar, z, R_z)
     if view is None:
         return None
-    if view.is_inside_gate:
-        correct(x, P, U, view.cov, missed)
-    return view.is_inside_gate, view.innovation, view.innovation_cov
+    cov, e, S = view
+    is_used = is_inside(e, S, sonar.gate)
+    if is_used:
+        correct(x, P, U, cov, missed)
+    return is_used, e, S

@@ -132,21 +132,19 @@ def correction(P: Floats, U: Floats, S: Floats, e: Floats) -> Floats:
     """
     n, L, V, y, Ke = len(P), S.copy(), U.copy(), e.copy(), np.zeros(len(P))
     for r in range(len(e)):
-        for c in range(r):
-            L[r, r] -= L[r, c] * L[r, c]
-            y[r] -= L[r, c] * y[c]
-            for i in range(n):
-                V[r, i] -= L[r, c] * V[c, i]
         if not L[r, r] > 0.0:
             raise np.linalg.LinAlgError("the covariance of an innovation is not positive definite")
-        L[r, r] = math.sqrt(L[r, r])
-        for k in range(r + 1, len(e)):
-            for c in range(r):
-                L[k, r] -= L[k, c] * L[r, c]
-            L[k, r] /= L[r, r]
-        y[r] /= L[r, r]
+        root = math.sqrt(L[r, r])
+        y[r] /= root
         for i in range(n):
-            V[r, i] /= L[r, r]
+            V[r, i] /= root
+        for k in range(r + 1, len(e)):
+            L[k, r] /= root
+            y[k] -= L[k, r] * y[r]
+            for i in range(n):
+                V[k, i] -= L[k, r] * V[r, i]
+            for c in range(r + 1, k + 1):
+                L[k, c] -= L[k, r] * L[c, r]
         for i in range(n):
             Ke[i] += V[r, i] * y[r]
             for j in range(n):
@@ -209,19 +207,9 @@ def is_inside(e: Floats, S: Floats, gate: float) -> bool:
     return bool(e @ np.linalg.solve(S, e) <= gate)
 
 
-class FarView(NamedTuple):
-    """A landmark compared with the point seen, where it is far from the place predicted."""
-
-    cov: Floats
-    """Covariance of the point seen less the landmark, with the noise of the detection, shape (3, 3)."""
-    innovation: Floats
-    """Of range and azimuth, shape (2,)."""
-    innovation_cov: Floats
-    """Shape (2, 2)."""
-    is_inside_gate: bool
-
-
-def far_view(missed: Floats, cov: Floats, G_z: Floats, sonar: SonarModel, z: Floats, R_z: Floats) -> FarView | None:
+def far_view(
+    missed: Floats, cov: Floats, G_z: Floats, sonar: SonarModel, z: Floats, R_z: Floats
+) -> tuple[Floats, Floats, Floats] | None:
     """Compare a landmark with the point seen, which is linear in both positions; None where `observe` is linear enough.
 
     With the variances A along the beam and L across it, in the sonar's plane, the linearisation at the predicted place
@@ -234,7 +222,11 @@ def far_view(missed: Floats, cov: Floats, G_z: Floats, sonar: SonarModel, z: Flo
     missed, cov
         The point seen at elevation 0 less the landmark, (3,), and its covariance by state and motion, (3, 3).
     G_z
-        Derivative of the point seen by (range, azimuth, elevation) (3, 3).
+        Derivative of the point seen by (range, azimuth, elevation), (3, 3).
+
+    Returns
+    -------
+    The covariance with the noise of the detection (3, 3); the innovation of range and azimuth (2,) and its covariance.
     """
     r, along, across = z[0], G_z[:, 0], G_z[:, 1]
     A, L_r2 = along @ cov @ along, across @ cov @ across
@@ -245,18 +237,11 @@ def far_view(missed: Floats, cov: Floats, G_z: Floats, sonar: SonarModel, z: Flo
     cov = cov + G_z @ V @ G_z.T
     cov = 0.5 * (cov + cov.T)
     B = np.array([along, across / r**2])  # range and azimuth by the point
-    innovation, innovation_cov = B @ missed, B @ cov @ B.T
-    return FarView(cov, innovation, innovation_cov, is_inside(innovation, innovation_cov, sonar.gate))
+    return cov, B @ missed, B @ cov @ B.T
 
 
 def check_rows(measurements: Measurements) -> None:
-    """Refuse rows that only a mistake of the caller can explain.
-
-    Raises
-    ------
-    MeasurementError
-        When a detection or a depth sample is stamped after ``end_ns``.
-    """
+    """Refuse detections and depth samples stamped after ``end_ns``, which only a mistake of the caller can explain."""
     end_ns = measurements.end_ns
     for rows in (measurements.detections, measurements.depth):
         if rows is not None and rows.stamps_ns[-1] > end_ns:

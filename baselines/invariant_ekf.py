@@ -130,9 +130,11 @@ class InvariantEkf(FilterShell):
             HP, S = innovation_covariance(state, H, G_m @ motion.C @ G_m.T)
             view = far_view(missed, S, G_z, self.sonar, z, R_z)
             if view is not None:
-                if view.is_inside_gate:
-                    correct(state, HP, view.cov, missed)
-                return view.is_inside_gate, view.innovation, view.innovation_cov
+                S, e, S_view = view
+                is_used = is_inside(e, S_view, self.sonar.gate)
+                if is_used:
+                    correct(state, HP, S, missed)
+                return is_used, e, S_view
         predicted, H, H_m = observation(state, k, motion, self.sonar)
         e = z - predicted
         e[1] = wrap_angle(e[1])

@@ -236,11 +236,11 @@ def test_the_noise_of_a_view_holds_that_of_many_beams_and_without_aperture_is_th
     """Of elevations anywhere in the aperture, for a length that is taken at elevation zero."""
     elevation = np.random.default_rng(3).uniform(-APERTURE_RAD / 2, APERTURE_RAD / 2, 200_000)
     wide = 1e3 * np.eye(3)
-    V = far(wide, np.eye(3), 40.0, np.zeros((2, 2))).cov - wide
+    V = far(wide, np.eye(3), 40.0, np.zeros((2, 2)))[0] - wide
     assert V[0, 0] == pytest.approx(np.mean(np.square(40.0 * (1 - np.cos(elevation)))), rel=0.02)
     assert V[2, 2] == pytest.approx(np.var(elevation), rel=0.02)
     noise = np.array([[0.04, -0.003], [-0.003, 0.0009]])
-    V = far(1e6 * np.eye(3), np.eye(3), 40.0, noise, aperture_rad=0.0).cov - 1e6 * np.eye(3)
+    V = far(1e6 * np.eye(3), np.eye(3), 40.0, noise, aperture_rad=0.0)[0] - 1e6 * np.eye(3)
     assert_allclose(V, np.pad(noise, (0, 1)), atol=1e-9)
 
 
@@ -261,7 +261,7 @@ TURNED = Rotation.from_euler("xyz", [0.4, -0.7, 1.9]).as_matrix()
 def test_a_shift_and_what_is_linear_are_the_same_wherever_the_sonar_points(range_m):
     """Of range and azimuth, blind to elevation; with 0.3 m along and 0.2 m across, 2 % on each side of linear."""
     G_z, cov = TURNED @ np.diag([1.0, range_m, range_m]), TURNED @ np.diag([0.09, 0.04, 4.0]) @ TURNED.T
-    shift = far(1e6 * np.eye(3), G_z, range_m, np.eye(2), G_z @ [0.3, 0.02, 5.0]).innovation
+    shift = far(1e6 * np.eye(3), G_z, range_m, np.eye(2), G_z @ [0.3, 0.02, 5.0])[1]
     assert_allclose(shift, [0.3, 0.02], atol=1e-12)
     longer_m, turned_rad = 0.04 / (2 * range_m), 0.3 * 0.2 / range_m**2
     for share, is_linear in ((0.98, False), (1.02, True)):
