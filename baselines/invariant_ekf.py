@@ -12,7 +12,7 @@ from baselines.invariant_equations import (
     BARE,
     BETA,
     BODY,
-    POINT,
+    EYE,
     THETA,
     UP,
     InvariantState,
@@ -126,7 +126,7 @@ class InvariantEkf(FilterShell):
             x, G, G_m, G_z = location(state, motion, self.sonar, z, 0.0)
             # Exp(theta) turns both points: what is missed is xi_k - xi_new, without theta however far they are apart
             missed, H = x - state.points[k], -G
-            H[:, place_of(k)] += np.eye(POINT)
+            H[:, place_of(k)] += EYE
             HP, S = innovation_covariance(state, H, G_m @ motion.C @ G_m.T)
             view = far_view(missed, S, G_z, self.sonar, z, R_z)
             if view is not None:
@@ -169,7 +169,7 @@ def start_state(calibration: Calibration) -> InvariantState:
     start = calibration.start
     R, X = start.pose().rotation().matrix(), np.array(start.position_m)
     A, P = np.zeros((BARE, 6)), np.zeros((BARE, BARE))
-    A[THETA, :3], A[BODY, :3], A[BODY, 3:] = R, hat(X) @ R, np.eye(3)
+    A[THETA, :3], A[BODY, :3], A[BODY, 3:] = R, hat(X) @ R, EYE
     P = A @ np.diag(np.square((*start.rpy_sigma_rad, *start.position_sigma_m))) @ A.T
-    P[BETA, BETA] = np.eye(3) * calibration.imu.gyro_bias_sigma**2
+    P[BETA, BETA] = EYE * calibration.imu.gyro_bias_sigma**2
     return InvariantState(R, X[None].copy(), np.zeros(3), symmetric(P))

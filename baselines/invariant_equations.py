@@ -52,8 +52,8 @@ THETA, BETA, BODY = slice(0, 3), slice(3, 6), slice(6, 9)
 """Places of theta, beta and xi_0 in xi."""
 BARE, POINT = 9, 3
 """Length of xi without landmarks, and of one xi_k."""
-UP = np.array([0.0, 0.0, 1.0])
-SKEWS = np.array([[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]], float)
+UP, EYE = np.array([0.0, 0.0, 1.0]), np.eye(3)
+SKEWS = np.array([np.cross(e, EYE).T.ravel() for e in EYE])
 """``[e_x]x``, ``[e_y]x`` and ``[e_z]x``, one a row."""
 
 
@@ -117,7 +117,7 @@ def predict(state: InvariantState, motion: Motion, walk_variance: float) -> None
     JD = J @ motion.D
     M = JD @ (P[BETA] + 0.5 * P[BETA, BETA] @ JD.T) + J @ (0.5 * motion.C) @ J.T
     P += M + M.T
-    P[BETA, BETA] += walk_variance * np.eye(3)
+    P[BETA, BETA] += walk_variance * EYE
 
 
 def pose_covariance(state: InvariantState, motion: Motion) -> Floats:
@@ -136,13 +136,13 @@ def pose_covariance(state: InvariantState, motion: Motion) -> Floats:
 def landmark_covariance(state: InvariantState, k: int) -> Floats:
     """Covariance of the coordinates of x_k in the world, ``xi_k - [x_k]x theta``, shape (3, 3), m²."""
     A = np.zeros((POINT, len(state.P)))
-    A[:, place_of(k)], A[:, THETA] = np.eye(POINT), -hat(state.points[k])
+    A[:, place_of(k)], A[:, THETA] = EYE, -hat(state.points[k])
     return symmetric(A @ state.P @ A.T)
 
 
-def moved(q: Floats) -> Floats:
-    """``Q(q)``, shape (3, 6)."""
-    return np.concatenate((-hat(q), np.eye(3)), axis=1)
+def Q(q: Floats) -> Floats:
+    """``[ -[q]x  I ]``, shape (3, 6): by eps, ``R' Q eps`` moves a point q of the body."""
+    return np.concatenate((-hat(q), EYE), axis=1)
 
 
 def observation(state: InvariantState, k: int, motion: Motion, sonar: SonarModel) -> tuple[Floats, Floats, Floats]:
@@ -151,9 +151,9 @@ def observation(state: InvariantState, k: int, motion: Motion, sonar: SonarModel
     q = R.T @ (state.points[k] - X)
     z, D_q = project(sonar.body_R_sonar.T @ (q - sonar.body_p_sonar))
     N = D_q @ sonar.body_R_sonar.T
-    H, H_m = np.zeros((2, len(state.P))), -N @ moved(q)
+    H, H_m = np.zeros((2, len(state.P))), -N @ Q(q)
     H[:, place_of(k)], H[:, BODY] = N @ R.T, -N @ R.T
-    H[:, BETA] = H_m @ motion.D
+    H[:, BETA] = H_m @ motion.D  # (4)
     return z, H, H_m
 
 
@@ -167,9 +167,9 @@ def location(
     """
     R, X = pose(state, motion)
     q = sonar.body_p_sonar + sonar.body_R_sonar @ sonar_point(z[0], z[1], elevation_rad)
-    G, G_m = np.zeros((3, len(state.P))), R @ moved(q)
-    G[:, BODY] = np.eye(3)
-    G[:, BETA] = G_m @ motion.D
+    G, G_m = np.zeros((3, len(state.P))), R @ Q(q)
+    G[:, BODY] = EYE
+    G[:, BETA] = G_m @ motion.D  # (4)
     return X + R @ q, G, G_m, R @ sonar.body_R_sonar @ sonar_point_jacobian(z[0], z[1], elevation_rad)
 
 
@@ -177,16 +177,16 @@ def height_of_body_point(state: InvariantState, motion: Motion, q: Floats) -> tu
     """Height of point q of the body, H (1, 9 + 3 N) and H_m (1, 6) of (7)."""
     R, X = pose(state, motion)
     a = X + R @ q
-    H, H_m = np.zeros((1, len(state.P))), R[2:] @ moved(q)
-    H[0, THETA], H[0, BODY] = UP @ -hat(a), UP
-    H[:, BETA] = H_m @ motion.D
+    H, H_m = np.zeros((1, len(state.P))), R[2:] @ Q(q)
+    H[0, THETA], H[0, BODY] = (a[1], -a[0], 0.0), UP  # a x e_z
+    H[:, BETA] = H_m @ motion.D  # (4)
     return a[2], H, H_m
 
 
 def height_of_point(state: InvariantState, k: int) -> tuple[float, Floats]:
     """Height of x_k and H (1, 9 + 3 N) of (7)."""
     H, a = np.zeros((1, len(state.P))), state.points[k]
-    H[0, THETA], H[0, place_of(k)] = UP @ -hat(a), UP
+    H[0, THETA], H[0, place_of(k)] = (a[1], -a[0], 0.0), UP
     return a[2], H
 
 
