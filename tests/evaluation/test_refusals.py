@@ -189,7 +189,7 @@ def test_a_landmark_that_isam2_could_not_place_reaches_the_comparison(monkeypatc
     first = {int(sequence.detections.most_probable()[0][0])}
 
     def without(self: SightingFactors, sighting: Any, key: int) -> Any:
-        return [] if {key} == {L(id_) for id_ in first} else placed(self, sighting, key)
+        return {} if {key} == {L(id_) for id_ in first} else placed(self, sighting, key)
 
     monkeypatch.setattr(SightingFactors, "_placed", without)
     (line, *_) = run_estimator(sequence, "isam2").withheld

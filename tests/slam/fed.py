@@ -91,7 +91,7 @@ def assert_is_least_squares(fed: Fed, numbers: Rail, nodes: int, landmarks: tupl
     assert fed.joint(newest)[3, 3] == pytest.approx(variance[f"x{nodes - 1}"], abs=1e-8)
     for i in landmarks:
         assert fed.smoother.values.atPoint3(L(i))[0] == pytest.approx(mean[f"l{i}"], abs=1e-8)
-        assert fed.smoother.covariance(L(i))[0, 0] == pytest.approx(variance[f"l{i}"], abs=1e-8)
+        assert fed.smoother.marginals.marginalCovariance(L(i))[0, 0] == pytest.approx(variance[f"l{i}"], abs=1e-8)
 
 
 def in_the_basin(

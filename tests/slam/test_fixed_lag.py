@@ -96,7 +96,9 @@ def test_where_cholesky_gives_up_on_the_marginal_qr_makes_it(monkeypatch: pytest
             smoother.update(float(k))
     smoother.exchange(2.0, handles[:1], [FactorGroup({"prior": factor(0, PRIOR_M)})])
     assert ways == [False, True]
-    assert smoother.covariance(X(2)) == pytest.approx((PRIOR_M**2 + 0.1**2 + WEAK_M**2) * np.eye(6), rel=1e-6)
+    assert smoother.marginals.marginalCovariance(X(2)) == pytest.approx(
+        (PRIOR_M**2 + 0.1**2 + WEAK_M**2) * np.eye(6), rel=1e-6
+    )
     assert not smoother.withheld
 
 

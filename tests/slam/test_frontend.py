@@ -168,7 +168,7 @@ def test_a_known_floor_gives_the_elevation():
     assert dive.smoother.values.atPoint3(L(5)) == pytest.approx(truth, abs=1e-9)
     assert dive.smoother.graph.size() == 1 + 4
     settle(dive)
-    assert np.sqrt(dive.smoother.covariance(L(5))[2, 2]) == pytest.approx(FLOOR.sigma_m, rel=1e-3)
+    assert np.sqrt(dive.smoother.marginals.marginalCovariance(L(5))[2, 2]) == pytest.approx(FLOOR.sigma_m, rel=1e-3)
 
 
 DOUBTFUL_HEIGHT = Start(position_sigma_m=(0.05, 0.02, 2.0), rpy_sigma_rad=(0.01, 0.01, 0.03))
@@ -207,7 +207,7 @@ def test_elevation_is_said_once_for_a_landmark():
         dive.see(0.01 * k, (5, 3.0, 0.0))
     settle(dive)
     up = np.array([np.cos(0.2) * np.sin(0.4), np.sin(0.2) * np.sin(0.4), np.cos(0.4)])
-    cov = dive.smoother.covariance(L(5))
+    cov = dive.smoother.marginals.marginalCovariance(L(5))
     elevation_sigma = SONAR.elevation_aperture_rad / np.sqrt(12)
     assert np.sqrt(up @ cov @ up) == pytest.approx(3.0 * np.tan(elevation_sigma), rel=0.01)
     assert dive.outcomes == [Outcome.NEW] + [Outcome.USED] * 8
@@ -221,7 +221,7 @@ def waiting(greatest_gain: float) -> Dive:
 
 
 def range_variance(dive: Dive) -> float:
-    return float(BEAM @ dive.smoother.covariance(L(5)) @ BEAM)
+    return float(BEAM @ dive.smoother.marginals.marginalCovariance(L(5)) @ BEAM)
 
 
 def test_sightings_wait_until_together_they_have_something_to_tell():

@@ -198,7 +198,9 @@ def same(one: Smoother, other: Smoother) -> None:
     assert one.values.equals(other.values, 1e-9)
     assert one.graph.size() == other.graph.size()
     for key in (X(5), L(3)):
-        assert np.allclose(one.covariance(key), other.covariance(key), rtol=1e-7, atol=0)
+        assert np.allclose(
+            one.marginals.marginalCovariance(key), other.marginals.marginalCovariance(key), rtol=1e-7, atol=0
+        )
     (values, marginals), (others, other_marginals) = one.solve_history(), other.solve_history()
     assert values.equals(others, 1e-9)
     assert np.allclose(marginals.marginalCovariance(L(3)), other_marginals.marginalCovariance(L(3)), rtol=1e-7, atol=0)
@@ -263,7 +265,7 @@ def test_a_landmark_that_was_withheld_can_come_again():
     smoother.add({"range": range_factor(2, 7, 3.0), "prior": point_prior(L(7), POINT)})
     smoother.update(2.0)
     assert len(smoother.withheld) == 1
-    assert smoother.covariance(L(7))[0, 0] < 0.011
+    assert smoother.marginals.marginalCovariance(L(7))[0, 0] < 0.011
 
 
 def test_a_keyframe_without_odometry_is_named_with_what_is_missing():

@@ -67,7 +67,7 @@ def test_biases_in_a_row_are_least_squares(lag_s):
         b.append(np.sin(k) / reading)
     cov = np.linalg.inv(np.transpose(A) @ A)
     assert smoother.values.atPoint3(B(7)) == pytest.approx([(cov @ np.transpose(A) @ b)[7]] * 3, abs=1e-9)
-    assert np.diag(smoother.covariance(B(7))) == pytest.approx([cov[7, 7]] * 3, abs=1e-9)
+    assert np.diag(smoother.marginals.marginalCovariance(B(7))) == pytest.approx([cov[7, 7]] * 3, abs=1e-9)
 
 
 def test_covariances_are_computed_once_an_update_for_all_that_was_asked_for_lately(monkeypatch):
@@ -203,9 +203,9 @@ def test_a_held_keyframe_takes_late_factors_without_solving_the_history(monkeypa
 def test_a_keyframe_and_all_later_ones_are_held_until_the_time_given():
     for until_s, gone, kept in ((END_S, 2, range(3, NODES)), (8.0, 17, [18])):
         fed = on_the_rail(NODES, 1.1, held={X(3): until_s})
-        assert all(fed.smoother.covariance(X(k))[3, 3] > 0 for k in kept)
+        assert all(fed.smoother.marginals.marginalCovariance(X(k))[3, 3] > 0 for k in kept)
         with pytest.raises(IndexError):
-            fed.smoother.covariance(X(gone))
+            fed.smoother.marginals.marginalCovariance(X(gone))
 
 
 @pytest.mark.parametrize("later_s", [0.0, 0.1])
@@ -283,7 +283,7 @@ def test_drift_beyond_what_cholesky_takes_is_survived():
     with pytest.raises(RuntimeError, match="Indeterminate"):
         gtsam.ISAM2().update(graph_of(given), smoother.values)
     variance = sigmas[0] ** 2 + 2 * sigmas[1] ** 2
-    assert smoother.covariance(X(2))[5, 5] == pytest.approx(variance, rel=1e-6)
+    assert smoother.marginals.marginalCovariance(X(2))[5, 5] == pytest.approx(variance, rel=1e-6)
     assert smoother.solve_history()[1].marginalCovariance(X(2))[5, 5] == pytest.approx(variance, rel=1e-6)
 
 

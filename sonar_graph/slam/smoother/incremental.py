@@ -1,16 +1,13 @@
 """Incremental smoothing at a bounded cost per update, and the solution of the whole graph on request.
 
-Two solutions share the same factors (docs/theory/isam2.md):
-
-* the *window*: GTSAM's iSAM2 over the poses of the last ``lag_s`` seconds, all landmarks and all biases; older poses
-  are marginalised.
-* the *history*: every factor of the run, solved by Levenberg-Marquardt when the smoothed result is asked for.
+Two solutions share the same factors (docs/theory/isam2.md). The *window* is GTSAM's iSAM2 over the poses of the last
+``lag_s`` seconds, all landmarks and all biases. The *history* is every factor of the run, solved by Levenberg-Marquardt
+when the smoothed result is asked for; when it is *bounded*, the window's factors and the marginals of what has left.
 
 Marginalising freezes the linearisation of the landmarks that it touches. When one has since moved by more than
 ``stale_shift_m``, the history is solved and the window starts again from that solution; the graph must have grown by
 `RESTART_GROWTH` since, so that all restarts together cost some times the last one. The window also starts again when a
-factor is taken out that has been marginalised. A *bounded* history consists of the window's factors and the marginals
-of what has left; a new window then begins from those, with the older linearisations.
+factor is taken out that has been marginalised.
 """
 
 from collections import deque
@@ -181,16 +178,9 @@ class Smoother:
         self.values.insert(key, first)
 
     def add(self, factors: Factors, seen: tuple[int, Sightline] | None = None, *, gain: float = 0.0) -> int:
-        """Add factors that are used together or not at all, at the next update; their handle.
+        """Add factors that are used together or not at all (`FactorGroup`), at the next update; their handle.
 
-        Parameters
-        ----------
-        factors
-            By their labels in messages.
-        seen
-            Of a sighting: the key of its landmark, and where that was seen from.
-        gain
-            What they have to tell: predicted variance over noise variance.
+        ``gain``: what they have to tell, predicted variance over noise variance.
         """
         self._waiting_gain += gain
         self._solved = None
@@ -213,10 +203,13 @@ class Smoother:
 
     def flush(self, time_s: float) -> Changed:
         """Update with the factors that wait, if any; a bounded window keeps its variables."""
+        self._flush(time_s)
+        return self._changed()
+
+    def _flush(self, time_s: float) -> None:
         self._withhold_unusable()
         if self._store.new:
-            self._update(time_s, self._exchange_lag_s(time_s))
-        return self._changed()
+            self._update(time_s, self._lag_at(time_s, keeps_all=self.is_bounded))
 
     def exchange(
         self,
@@ -226,18 +219,11 @@ class Smoother:
         new_landmarks: Mapping[int, Floats] | None = None,
         lost_landmarks: Sequence[int] = (),
     ) -> Changed:
-        """Take groups of factors out, put others in, and update the window.
+        """Take groups of factors out by their handles, put others in, and update the window.
 
-        Parameters
-        ----------
-        removed
-            Handles of groups that go.
-        new_landmarks
-            Keys and first estimates.
-        lost_landmarks
-            Keys of those on which no factor is left.
+        New landmarks come with first estimates; lost are those on which no factor is left.
         """
-        flushed = self.flush(time_s)
+        self._flush(time_s)
         slots = self._window.slots(self._store.factors(removed))
         self._forget(lost_landmarks)
         self._store.remove(removed)
@@ -246,15 +232,14 @@ class Smoother:
         handles = [self.add(group.factors, group.seen) for group in added]
         self._withhold_unusable()
         keys = graph_of(self._store.new.values()).keyVector()
-        self._window.lag_s = self._exchange_lag_s(time_s)
+        self._window.lag_s = self._lag_at(time_s, keeps_all=self.is_bounded)
         if slots is None or lost_landmarks or len(self.in_window(keys)) < len(keys):
             self._kept_covariance.renew(self._landmarks)
             self._restart(time_s)
         else:
             self._update(time_s, self._window.lag_s, slots)
             self.settle(time_s)
-        changed = self._changed()
-        return Changed(handles, flushed.withheld | changed.withheld, flushed.left | changed.left)
+        return self._changed(handles)
 
     def settle(self, time_s: float) -> None:
         """Gauss-Newton steps until nothing would be relinearised any more, ten at most."""
@@ -265,21 +250,19 @@ class Smoother:
         self._kept_covariance.outdate()
         self._take(self._window.isam.calculateEstimate())
 
-    def _changed(self) -> Changed:
+    def _changed(self, added: Sequence[int] = ()) -> Changed:
         """Changes since the last answer."""
-        changed = Changed([], self._refused, self._left)
+        changed = Changed(list(added), self._refused, self._left)
         self._refused, self._left = set(), set()
         return changed
 
-    def _exchange_lag_s(self, time_s: float) -> float:
-        """Nothing leaves a bounded window between what an exchange takes out and what it puts in."""
-        inside_s = [time_s - t + ROUNDING_S for t in self._expiring.values()] if self.is_bounded else []
-        return max([self._lag_at(time_s), *inside_s])
+    def _lag_at(self, time_s: float, *, keeps_all: bool = False) -> float:
+        """Age (s) from which on poses leave the window.
 
-    def _lag_at(self, time_s: float) -> float:
-        """Age (s) from which on poses leave the window."""
-        held = (time_s - self._expiring[key] + ROUNDING_S for key, until_s in self._held.items() if time_s <= until_s)
-        return max([self.params.lag_s, *held])
+        ``keeps_all``: none leaves, as between what an exchange takes out of a bounded window and what it puts in.
+        """
+        held = self._expiring if keeps_all else [key for key, until_s in self._held.items() if time_s <= until_s]
+        return max([self.params.lag_s, *(time_s - self._expiring[key] + ROUNDING_S for key in held)])
 
     def in_window(self, keys: list[int]) -> list[int]:
         """Keys of variables that are in the window, or about to be."""
@@ -415,10 +398,6 @@ class Smoother:
     def marginals(self) -> gtsam.ISAM2:
         """Source of covariances of variables in the window."""
         return self._window.isam.getISAM2()
-
-    def covariance(self, key: int) -> Floats:
-        """Marginal covariance of a variable in the window."""
-        return self._window.isam.marginalCovariance(key)
 
     def joint_covariance(self, keys: list[int]) -> JointCovariance:
         """Joint marginal covariance of variables in the window, and possibly of more of them."""
