@@ -305,18 +305,27 @@ class DetectionJournal:
         """Independent copy."""
         return deepcopy(self)
 
-    def amend(self, row: int, outcome: Outcome, landmark_id: int | None = None) -> None:
-        """Change the outcome of a row, and its landmark unless None.
+    def amend(
+        self,
+        row: int,
+        outcome: Outcome,
+        landmark_id: int | None = None,
+        innovation: Floats | None = None,
+        innovation_cov: Floats | None = None,
+    ) -> None:
+        """Change the outcome of a row, and its landmark unless None; innovation and covariance as in `record`.
 
-        The innovation is dropped: it was against the landmark that the detection was first taken for.
+        An earlier innovation is dropped: it was against the landmark that the detection was first taken for.
         """
         row -= self._forgotten
         if row < 0:
             return
         self._outcomes[row] = _NUMBER[outcome]
         self._ids[row] = self._ids[row] if landmark_id is None else landmark_id
-        self._innovations[2 * row : 2 * row + 2] = array("d", _UNKNOWN[:2])
-        self._innovation_covs[4 * row : 4 * row + 4] = array("d", _UNKNOWN)
+        e = _UNKNOWN[:2] if innovation is None else innovation.tolist()
+        S = _UNKNOWN if innovation_cov is None else innovation_cov.ravel().tolist()
+        self._innovations[2 * row : 2 * row + 2] = array("d", e)
+        self._innovation_covs[4 * row : 4 * row + 4] = array("d", S)
 
     def log(self) -> DetectionLog:
         """Rows that are not forgotten."""

@@ -371,7 +371,7 @@ def test_a_mean_of_recorded_runs_is_over_all_robots_and_none_that_counts_is_lost
     for failing, is_met in (
         ({}, True),
         ({("isam2 robust", share): 2, ("ekf-slam", 0.0): 5}, True),
-        ({("isam2 gnc", share): 1}, False),
+        ({("isam2 max-mixture", share): 1}, False),
         ({("isam2 gate", 0.0): 1}, False),
     ):
         assert falsified.is_met(collected(falsified, failing)) is is_met

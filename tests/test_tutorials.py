@@ -189,7 +189,7 @@ def test_page_on_doubtful_identities_has_commands_and_programs_that_show_what_it
     }.items():
         assert said in printed[words]
     compared, asked = (output(tmp_path, "python", "-W", "error", "-c", program) for program in blocks(page, "python"))
-    off_m = [number_after(compared, rf"{name} [\d.]+") for name in ("default", "gate", "max-mixture", "gnc")]
+    off_m = [number_after(compared, rf"{name} [\d.]+") for name in ("default", "gate", "max-mixture")]
     assert min(off_m[:2]) > 2
     assert max(off_m[2:]) < 0.1
     assert assert_landmarks_are_true(asked, 0.2) == 4

@@ -21,7 +21,6 @@ ESTIMATORS: dict[str, tuple[str, dict[str, Any]]] = {
     "iSAM2, robust": ("isam2", {"identity": {"longest_wait_s": 0}}),
     "iSAM2, deferred": ("isam2", {}),
     "iSAM2, max-mixture": ("isam2", {"identity": {"policy": "max-mixture"}}),
-    "iSAM2, gnc": ("isam2", {"identity": {"policy": "gnc"}}),
 }
 """By the name in the table: entry point and settings."""
 LOST_M = 1.0

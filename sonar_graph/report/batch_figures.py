@@ -60,8 +60,8 @@ def folded(name: str, letters: int) -> str:
 
     Examples
     --------
-    >>> folded("isam2/identity.policy=gnc", 18)
-    'isam2/\nidentity.policy=\ngnc'
+    >>> folded("isam2/identity.policy=gate", 18)
+    'isam2/\nidentity.policy=\ngate'
     >>> folded("tracks, wrong_id_rate=0.05", 20)
     'tracks,\nwrong_id_rate=0.05'
     """

@@ -22,7 +22,7 @@ from sonar_graph.errors import CalibrationError, EstimatorError
 from sonar_graph.measurements import NS_PER_S, Floats, Ints, Measurements
 from sonar_graph.motion import MotionSource
 from sonar_graph.slam.estimates import AnchoredPose, Over, PoseHistory, joint_covariance
-from sonar_graph.slam.frontend import Sightings
+from sonar_graph.slam.frontend import Frontend
 from sonar_graph.slam.keyframes import KeyframeParams, Keyframes
 from sonar_graph.slam.landmarks import IdentityParams, MixtureIdentity, RobustIdentity
 from sonar_graph.slam.models import KernelParams, RobustKernel
@@ -105,7 +105,7 @@ class Isam2:
         self._asked = PoseHistory()
         self._smoother = Smoother(p.smoother, self._asked if p.history.policy == "bounded" else None)
         self._keyframes = Keyframes(calibration, odometry, p.keyframes, self._smoother)
-        self._sightings = Sightings(calibration, p.identity, p.kernel, self._smoother, self._keyframes)
+        self._sightings = Frontend(p.identity, p.kernel, self._keyframes)
         self._forgot_s = -math.inf
 
     @property
@@ -221,7 +221,7 @@ class Isam2:
         EstimatorError
             When something is not known, or has left the window; it says what there is.
         """
-        history = self._sightings.history
+        history = self._sightings.smoothed
         return joint_covariance(
             self._smoother, history, self._keyframes.stamps_ns, over, keyframes, stamps_ns, landmarks
         )
@@ -234,12 +234,12 @@ class Isam2:
         Doubtful identities are those that fit the whole history best, chosen beside the run, which asking leaves as it
         was.
         """
-        values, marginals, _ = self._sightings.history()
+        values, marginals, _ = self._sightings.smoothed()
         return self._asked.trajectory(values, marginals)
 
     def landmarks(self) -> LandmarkMap:
         """Landmarks by identity after solving the whole graph, with marginal covariances."""
-        values, marginals, ids = self._sightings.history()
+        values, marginals, ids = self._sightings.smoothed()
         return LandmarkMap(
             np.array(ids, dtype=np.int64),
             np.array([values.atPoint3(L(i)) for i in ids]).reshape(-1, 3),

@@ -132,8 +132,8 @@ def test_estimator_of_another_package_has_the_hash_of_that_and_one_that_cannot_b
 
 
 def test_settings_that_exclude_each_other_are_told_with_line_and_key(write_suite):
-    text = 'params = { identity.policy = "gnc" }\ngrid = { history.policy = ["whole", "bounded"] }\n'
-    with pytest.raises(BatchError, match=r'line 11: estimators\.0\.grid\.history: .*"gnc", which chooses anew'):
+    text = 'params = { identity.policy = "max-mixture" }\ngrid = { history.policy = ["whole", "bounded"] }\n'
+    with pytest.raises(BatchError, match=r'line 11: estimators\.0\.grid\.history: .*"max-mixture", which chooses anew'):
         planned(write_suite, HEADER_OF_ISAM2, BASIN, ISAM2, text)
 
 

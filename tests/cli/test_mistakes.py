@@ -73,8 +73,8 @@ MISTAKES = {
     "--": "sonar-graph --help",
     "simulate basin -o new.mcap --set tracks=true --set tracks=false": "tracks is also set to True; give it once",
     "simulate basin -o new.mcap --set wrong_id_share=0.3": "wrong_id_share = 0.3 is a share of a track; set tracks",
-    "run notes.txt -o out --set isam2.identity.policy=gnc --set isam2.history.policy=bounded": (
-        'history.policy = "bounded" cannot be with identity.policy = "gnc"'
+    "run notes.txt -o out --set isam2.identity.policy=max-mixture --set isam2.history.policy=bounded": (
+        'history.policy = "bounded" cannot be with identity.policy = "max-mixture"'
     ),
     "run notes.txt -o out --set isam2.history.remembered_s=10": (
         'there is no such field with policy = "whole"; history.policy = "bounded" has it'

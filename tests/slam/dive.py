@@ -7,7 +7,7 @@ from sonar_graph.calibration import Calibration, FloorPrior, ImuCalibration, Mou
 from sonar_graph.measurements import Dvl, Floats, Imu
 from sonar_graph.navigation import Odometry
 from sonar_graph.slam import GatedIdentity, GaussianKernel, KeyframeParams, MixtureIdentity, RobustKernel
-from sonar_graph.slam.frontend import Sightings
+from sonar_graph.slam.frontend import Frontend
 from sonar_graph.slam.keyframes import Keyframes
 from sonar_graph.slam.landmarks.tracked import TrackedIdentity
 from sonar_graph.slam.smoother.incremental import Smoother
@@ -48,7 +48,7 @@ class Dive:
     ) -> None:
         self.smoother = smoother or smoother_with(lag_s, 1e-6, 1e9)
         self.keyframes = Keyframes(calibration, Odometry(calibration), POLICY, self.smoother)
-        self.sightings = Sightings(calibration, identity, kernel, self.smoother, self.keyframes)
+        self.sightings = Frontend(identity, kernel, self.keyframes)
         stamps = T0_NS + np.arange(-1, 101) * NS // 10
         doppler = np.r_[START_NS, stamps[1:]]  # the second row confirms the first
         n = len(stamps)

@@ -8,10 +8,18 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.stats import chi2, multivariate_normal
 
-from sonar_graph.measurements import Floats, LandmarkDetections
-from sonar_graph.slam.landmarks.association import LEAST_LANDMARKS, IdentityPosterior, RecogniserErrors, identify
+from sonar_graph.measurements import NO_TRACK, Floats, LandmarkDetections
+from sonar_graph.slam.landmarks.association import (
+    LEAST_LANDMARKS,
+    NO_LANDMARK,
+    UNDECIDED,
+    IdentityPosterior,
+    RecogniserErrors,
+    decide,
+    identify,
+    second_rows_of_tracks,
+)
 from sonar_graph.slam.landmarks.joint_compatibility import UNPAIRED, Innovations, Pairing, believed, pair_jointly
-from sonar_graph.slam.landmarks.tracked import NO_LANDMARK, UNDECIDED, decide
 from sonar_graph.states import DetectionJournal, Outcome
 
 from .made import detected
@@ -97,6 +105,21 @@ def test_only_what_is_more_probable_than_all_else_is_named(probability: list[flo
 )
 def test_what_reaches_the_least_probability_is_decided(belief: list[float], decided: int) -> None:
     assert decide(stated([0, 0], [4, 7], [belief, [1.0, 0.0]]), 0.75) == [decided, 4]
+
+
+def test_of_a_tracks_rows_the_one_stays_that_its_identity_explains_best() -> None:
+    """Of a track that counts as nothing the most probable row, of equals the first; of one named twice the sum."""
+
+    def kept(tracks: list[int], beliefs: list[list[float]], identity: int = UNDECIDED, ids: list | None = None) -> list:
+        rows = detected(0, np.ones((len(tracks), 2)), ids or [4, 5, 6, 7], beliefs, tracks)
+        return [k for k, why in enumerate(second_rows_of_tracks(rows, dict.fromkeys(tracks, identity))) if why is None]
+
+    flat = [0.2] * 4
+    one = [3, 3, NO_TRACK, 8], [[0.9, 0, 0, 0], [0, 0, 0.8, 0], [1.0, 0, 0, 0], flat]
+    assert kept(*one, 6) == [1, 2, 3]
+    assert kept(*one, 4) == [0, 2, 3]
+    assert kept([3, 3, 3, NO_TRACK, NO_TRACK], [flat, [0, 0.8, 0, 0], [0, 0, 0.8, 0], flat, flat]) == [1, 3, 4]
+    assert kept([3, 3], [[0, 0.6, 0, 0], [0.4, 0.4, 0, 0]], 0, [0] * 4) == [1]
 
 
 PROBABILITY = 0.95

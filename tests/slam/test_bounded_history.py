@@ -85,8 +85,8 @@ def held(estimator: Isam2) -> dict[str, int]:
         "groups": len(smoother._store._groups) + sum(map(len, smoother._store._leaving_with.values())),
         "expiring": len(smoother._expiring),
         "sightlines": sum(map(len, smoother._store.sightlines().values())),
-        "sightings": sum(len(seen) for seen in sightings._landmarks._of.values()),
-        "tracks": sum(len(t.waiting) + len(t.settled) for t in sightings._deferred._tracks.values()),
+        "sightings": sum(len(seen) for seen in sightings.landmarks._of.values()),
+        "tracks": sum(len(t.waiting) + len(t.settled) for t in sightings.policy._tracks.values()),
         "asked": len(estimator._asked._open),
     }
 

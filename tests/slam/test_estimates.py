@@ -160,7 +160,7 @@ def test_names_of_landmarks_without_names_are_refused_where_these_begin():
     assert FIRST_ANONYMOUS_ID in run(named, 1 / STEP_S).landmarks().ids
 
 
-@pytest.mark.parametrize("policy", ["robust", "gate", "max-mixture", "gnc"])
+@pytest.mark.parametrize("policy", ["robust", "gate", "max-mixture"])
 @pytest.mark.parametrize("range_m", [1.1e5, 1e10, 1e200])
 def test_a_range_beyond_any_sonar_is_refused_by_name_and_the_run_is_that_without_it(policy: str, range_m: float):
     sequence, _ = rail(8)

@@ -110,7 +110,7 @@ def test_one_identity_twice_in_a_frame_counts_once():
     log = dive.sightings.journal.log()
     assert log.outcomes == [Outcome.NEW, Outcome.REPEATED, Outcome.NEW]
     assert log.landmark_ids.tolist() == [5, 5, 6]
-    assert dive.sightings.ids == {5, 6}
+    assert dive.sightings.landmarks.ids == [5, 6]
     assert dive.smoother.graph.size() == 1 + 2 * 3
     dive.see(0.0, (5, 3.0, 0.0), (5, 3.01, 0.0))
     assert dive.outcomes[3:] == [Outcome.USED, Outcome.REPEATED]

@@ -180,7 +180,7 @@ def test_noise_of_zero_is_refused_by_name(basin, section, name):
 LAG_S = 3.0
 """Much less than the worlds last: what is wrong leaves the window before it is known to be."""
 IN_THE_GRAPH = {Outcome.NEW, Outcome.USED, Outcome.USED_LATER, Outcome.REASSIGNED}
-QUICK = ["max-mixture whole ignore", "gnc whole ignore", "robust bounded associate", "robust whole ignore"]
+QUICK = ["max-mixture whole ignore", "robust bounded associate", "robust whole ignore"]
 ALL = [" ".join(of) for of in product(("gate", "robust"), ("whole", "bounded"), ("ignore", "associate"))]
 SLOW = [pytest.param(chosen, marks=pytest.mark.slow) for chosen in ALL if chosen not in QUICK]
 
@@ -282,10 +282,10 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         {"identity.gate_probability": 0.9},
         'identity.gate_probability: there is no such field with policy = "robust"; identity.policy = "gate" has it',
     ),
-    "mixture without its policy": ({"identity.view_range_m": 5.0}, 'policy = "max-mixture" or "gnc" has it'),
+    "mixture without its policy": ({"identity.view_range_m": 5.0}, 'policy = "max-mixture" has it'),
     "unknown landmarks in a mixture": (
-        {"identity.policy": "gnc", "identity.unknown.policy": "associate"},
-        'identity.unknown: there is no such field with policy = "gnc"; identity.policy = "robust" or "gate" has it',
+        {"identity.policy": "max-mixture", "identity.unknown.policy": "associate"},
+        'no such field with policy = "max-mixture"; identity.policy = "robust" or "gate" has it',
     ),
     "association without its policy": ({"identity.unknown.sightings": 3}, 'identity.unknown.policy = "associate" has'),
     "belief in a mixture": ({"identity.policy": "max-mixture", "identity.minimum_probability": 0.9}, '"gate" has it'),
@@ -295,9 +295,12 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         {"identity.policy": "max-mixture", "history.policy": "bounded"},
         'history.policy = "bounded" cannot be with identity.policy = "max-mixture", which chooses anew in the whole',
     ),
-    "gnc in a bounded history": ({"identity.policy": "gnc", "history.policy": "bounded"}, 'policy = "gnc", which'),
+    "a mixture in a bounded history": (
+        {"identity.policy": "max-mixture", "history.policy": "bounded"},
+        'policy = "max-mixture", which',
+    ),
     "no such policy": ({"identity.policy": "gcn"}, "identity.policy: there is no 'gcn'; there are: robust, gate, max-"),
-    "a policy for its section": ({"identity": "gnc"}, 'identity: expected a section with policy = "gnc"'),
+    "a policy for its section": ({"identity": "gate"}, 'identity: expected a section with policy = "gate"'),
     "no such section": ({"smother.lag_s": 3}, "smother: there is no such field; did you mean smoother?"),
     "no such setting": (
         {"smoother": {"lag": 3}},

@@ -157,18 +157,6 @@ def test_gains_are_densities_over_that_of_no_landmark() -> None:
             assert found[n, k] == pytest.approx(expected, rel=1e-9)
 
 
-@pytest.mark.parametrize("count", [1, 3])
-@pytest.mark.parametrize("share", [0.99, 1.01])
-def test_the_truncation_is_where_a_landmark_is_as_probable_as_none(count: int, share: float) -> None:
-    values, said, frames = world(), {4: 0.1, 7: 0.8}, [0, 1, 2]
-    perfect = watch(values, PLACES[7], frames[:count], np.zeros((count, 2)), said)
-    (c2,) = MIXTURE.truncations([perfect])
-    seen = watch(values, PLACES[7], frames[:count], np.sqrt(share * c2 / count) * np.tile([0.6, 0.8], (count, 1)), said)
-    assert MIXTURE.squared_errors([seen], [7], values)[0] == pytest.approx(share * c2)
-    gain = log_weights(said, 7)[0] + log_density(values, seen, PLACES[7]) - log_weights(said, 7)[1] - of_nothing(seen)
-    assert gain == pytest.approx(0.5 * (1.0 - share) * c2, rel=1e-6)
-
-
 @pytest.mark.parametrize("is_alone", [True, False])
 def test_a_landmark_that_one_watch_has_put_where_it_is_has_no_place_for_it(is_alone: bool) -> None:
     """Else its perfect fit would be praised; others fit it, or do not, as any landmark."""

@@ -1,9 +1,13 @@
 """Max-mixture in the window: a fixed point that another solver finds, and choices that follow the estimate."""
 
+from collections import Counter
+from itertools import product
+
 import gtsam
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import L, X
+from scipy.stats import multivariate_normal
 
 from sonar_graph.calibration import FloorPrior, SonarCalibration
 from sonar_graph.measurements import Floats
@@ -11,17 +15,19 @@ from sonar_graph.slam import GaussianKernel, KeyframeParams, MixtureIdentity, Ro
 from sonar_graph.slam.landmarks import mixture
 from sonar_graph.slam.landmarks import mixture_policy as doubtful_identities
 from sonar_graph.slam.landmarks.association import IdentityPosterior, RecogniserErrors
-from sonar_graph.slam.landmarks.mixture import Mixture, TrackedObject
-from sonar_graph.slam.landmarks.mixture_policy import DoubtfulIdentities
-from sonar_graph.slam.landmarks.sighting import LandmarkSightings, Sighting, SightingFactors
+from sonar_graph.slam.landmarks.landmark_graph import Assignment, LandmarkGraph
+from sonar_graph.slam.landmarks.mixture import Choices, Mixture, TrackedObject
+from sonar_graph.slam.landmarks.mixture_policy import MixtureIdentities
+from sonar_graph.slam.landmarks.sighting import Sighting, SightingFactors
 from sonar_graph.slam.models import Kernel
 from sonar_graph.slam.smoother.batch_solution import Sightline
 from sonar_graph.states import DetectionJournal, Outcome
 
 from . import dive as dive_module
+from . import test_mixture as small
 from .dive import CALIBRATION, FLOOR, T0_NS, Dive, spherical
 from .graphs import gtsams_solution
-from .made import plain, scattered, smoother_with, values_of
+from .made import graph_of, plain, pose_prior, scattered, smoother_with, values_of
 
 PLACES = {7: np.array([2.6, 0.5, -1.0]), 4: np.array([2.9, 1.4, -1.0]), 9: np.array([3.2, 0.1, -1.0])}
 """Of landmarks, in the world of `Dive`: on the floor, within its sonar's fan."""
@@ -31,7 +37,7 @@ MIXTURE = Mixture(ERRORS, GAUSSIAN)
 
 
 def dive(policy: str, kernel: Kernel = GAUSSIAN) -> Dive:
-    identity = RobustIdentity() if policy == "robust" else MixtureIdentity(policy=policy)
+    identity = RobustIdentity() if policy == "robust" else MixtureIdentity()
     return Dive(CALIBRATION.model_copy(update={"floor": FLOOR}), identity, kernel)
 
 
@@ -62,21 +68,21 @@ def misnamed(policy: str, kernel: Kernel = GAUSSIAN, share: float = 0.25) -> tup
 
 
 def worst_landmark_m(world: Dive) -> float:
-    values = world.sightings.history().values
+    values = world.sightings.smoothed().values
     return max(float(np.linalg.norm(values.atPoint3(L(i)) - p)) for i, p in PLACES.items())
 
 
 def max_mixture(world: Dive) -> gtsam.NonlinearFactorGraph:
     """The same with Python factors that look for their largest component at every linearisation."""
-    doubtful = world.sightings._doubtful
-    handles = {s.handle for w in doubtful.watches for s in w.sightings}
-    graph, chosen = world.smoother.graph_without(handles), doubtful.history()
+    policy = world.sightings.policy
+    handles = {s.handle for w in policy.watches for s in w.sightings}
+    graph, chosen = world.smoother.graph_without(handles), policy._history()
     pairs = list(zip(chosen.watches, chosen.choices, strict=True))
     firsts = {i: min(w.sightings[0].row for w, choice in pairs if choice == i) for i in PLACES}
-    for w in doubtful.watches:
+    for w in policy.watches:
         (sighting,) = w.sightings
         first_of = next((i for i, row in firsts.items() if row == sighting.row), None)
-        maker = doubtful._maker
+        maker = world.sightings.landmarks.factors
         if first_of is not None:  # what is said once of a landmark does not depend on a choice
             for factor in list(maker.make(sighting, L(first_of), is_first=True).values())[2:]:
                 graph.push_back(factor)
@@ -121,7 +127,7 @@ def largest(named: int, components: dict[int, dict], sighting) -> gtsam.CustomFa
 
 def test_the_end_is_a_fixed_point_of_the_max_mixture_that_another_solver_finds() -> None:
     world, truth = misnamed("max-mixture")
-    values = world.sightings.history().values
+    values = world.sightings.smoothed().values
     start = scattered(values, np.random.default_rng(1), {"x": 3e-3, "l": 3e-3})
     found = gtsams_solution(max_mixture(world), start)
     for i in PLACES:
@@ -143,7 +149,7 @@ def test_right_names_give_the_graph_of_one_that_believes_them() -> None:
     worlds = [misnamed(policy, share=0.0)[0] for policy in ("max-mixture", "robust")]
     assert worlds[0].outcomes == worlds[1].outcomes
     for i in PLACES:
-        np.testing.assert_allclose(*(w.sightings.history().values.atPoint3(L(i)) for w in worlds), atol=1e-3)
+        np.testing.assert_allclose(*(w.sightings.smoothed().values.atPoint3(L(i)) for w in worlds), atol=1e-3)
 
 
 @pytest.mark.parametrize("can_move", [True, False])
@@ -183,9 +189,9 @@ def test_a_landmark_that_alone_was_named_wrongly_gets_its_name_with_all_sighting
         watch(world, 0.3 * k, {7: 7}, rng)
     for k, name in enumerate([4, 4, 4, 9, 9], start=4):
         watch(world, 0.3 * k, {9: name}, rng, track=2)
-    assert world.sightings.ids == {7, 9}
-    assert len(world.sightings._landmarks.sightings(9)) == 5
-    values = world.sightings.history().values
+    assert world.sightings.landmarks.ids == [7, 9]
+    assert len(world.sightings.landmarks.sightings(9)) == 5
+    values = world.sightings.smoothed().values
     assert np.linalg.norm(values.atPoint3(L(9)) - PLACES[9]) < 0.1
 
 
@@ -197,7 +203,7 @@ def test_what_names_no_landmark_has_no_vote_on_its_place(surely: float, where: i
         watch(world, 0.3 * k, {7: 7}, rng)
     for k in range(4, 34):
         watch(world, 0.3 * k, {4: 7}, rng, surely=surely)
-    assert np.linalg.norm(world.sightings.history().values.atPoint3(L(7)) - PLACES[where]) < 0.1
+    assert np.linalg.norm(world.sightings.smoothed().values.atPoint3(L(7)) - PLACES[where]) < 0.1
 
 
 def test_a_landmark_begins_with_one_of_those_that_name_it() -> None:
@@ -243,12 +249,12 @@ def test_a_track_that_gets_another_name_is_chosen_anew_also_where_it_has_left_th
         show(world, 0.3 * k, at(0.3 * k, 7), [4], [2])
     for k in range(3, 12):
         show(world, 0.3 * k, at(0.3 * k, 9), [9], [-1])
-    first = world.sightings._doubtful.watches[0]
+    first = world.sightings.policy.watches[0]
     assert first.landmark_id == 4
     assert not world.smoother.in_window([first.sightings[0].line.pose_key])
     show(world, 3.6, at(3.6, 7), [7], [2])
     assert first.landmark_id == 7
-    assert world.sightings.ids == {7, 9}
+    assert world.sightings.landmarks.ids == [7, 9]
 
 
 @pytest.mark.parametrize(("name", "is_waiting"), [(-1, True), (7, False)])
@@ -257,7 +263,7 @@ def test_keyframes_of_what_waits_are_held_and_of_what_is_known_are_not(
 ) -> None:
     world = short_lived(monkeypatch)
     show(world, 0.3, at(0.3, 7), [name], [2])
-    (first,) = world.sightings._doubtful.watches
+    (first,) = world.sightings.policy.watches
     for k in range(2, 12):
         show(world, 0.3 * k, at(0.3 * k, 9), [9], [-1])
     key = first.sightings[0].line.pose_key
@@ -269,13 +275,13 @@ def test_keyframes_of_what_waits_are_held_and_of_what_is_known_are_not(
 
 def test_what_waited_in_a_frame_that_shows_the_landmark_already_is_not_of_it(monkeypatch) -> None:
     """Before anything is chosen anew: what was surer in that frame has it."""
-    monkeypatch.setattr(DoubtfulIdentities, "reconsider", lambda *_: None)
+    monkeypatch.setattr(MixtureIdentities, "reconsider", lambda *_: iter(()))
     world = dive("max-mixture")
     for k in (1, 2):
         show(world, 0.3 * k, np.vstack([at(0.3 * k, 7), at(0.3 * k, 7, AFAR / 3)]), [7, -1], [-1, 2])
     show(world, 0.9, at(0.9, 4), [-1], [2])
     show(world, 1.2, at(1.2, 7), [7], [2])
-    stamps = [s.stamp_ns for s in world.sightings._landmarks.sightings(7)]
+    stamps = [s.stamp_ns for s in world.sightings.landmarks.sightings(7)]
     assert len(set(stamps)) == len(stamps) == 4
     assert world.outcomes == [
         *(Outcome.NEW, Outcome.UNFIT, Outcome.USED, Outcome.UNFIT),
@@ -285,7 +291,7 @@ def test_what_waited_in_a_frame_that_shows_the_landmark_already_is_not_of_it(mon
 
 def test_a_detection_of_a_known_track_gets_its_landmark_also_where_another_is_nearer(monkeypatch) -> None:
     """Before anything is chosen anew; without a track it is of the nearer landmark."""
-    monkeypatch.setattr(DoubtfulIdentities, "reconsider", lambda *_: None)
+    monkeypatch.setattr(MixtureIdentities, "reconsider", lambda *_: iter(()))
     world = dive("max-mixture")
     show(world, 0.3, np.vstack([at(0.3, 7), at(0.3, 9)]), [7, 9], [2, -1])
     for after_s, track in ((0.6, 2), (0.9, -1)):
@@ -293,11 +299,16 @@ def test_a_detection_of_a_known_track_gets_its_landmark_also_where_another_is_ne
     assert world.sightings.journal.log().landmark_ids.tolist() == [7, 9, 7, 9]
 
 
+def recorded(journal: DetectionJournal, seen: Sighting) -> Sighting:
+    seen.row = journal.record(seen.stamp_ns, 7, Outcome.WAITING)
+    return seen
+
+
 @pytest.mark.parametrize(("sigma_m", "stays"), [(0.01, False), (0.5, True)])
 def test_a_misfit_is_one_of_the_identity_only_where_the_estimate_is_sure(sigma_m: float, stays: bool) -> None:
     """Seen 0.3 m off from a second pose: as it stands, it is of nothing; expected with the pose's error, it may be."""
     smoother = smoother_with(1e9, 0.1, 1e9)
-    landmarks = LandmarkSightings(smoother, SightingFactors(SonarCalibration(), plain), DetectionJournal())
+    landmarks = LandmarkGraph(smoother, SightingFactors(SonarCalibration(), plain), journal := DetectionJournal())
     for k, sigma in enumerate((0.001, sigma_m)):
         smoother.add_pose(X(k), gtsam.Pose3(), float(k))
         sigmas = np.array([1e-3] * 3 + [sigma] * 3)
@@ -305,14 +316,72 @@ def test_a_misfit_is_one_of_the_identity_only_where_the_estimate_is_sure(sigma_m
     smoother.update(1.0)
     floor = FloorPrior(z_m=0.0, sigma_m=0.01)
     for k in range(2):
-        landmarks.exchange([], [(sighting(k, [3.0, 0.1], floor=floor), 7)], 1.0)
-    off = sighting(2, [3.3, 0.1], 1, floor)
-    landmarks._enter(off, 7, None)
-    seen, journal = TrackedObject(IdentityPosterior({7: 0.9}), [off]), DetectionJournal()
-    off.row = journal.record(off.stamp_ns, 7, Outcome.USED)
-    doubtful = DoubtfulIdentities(landmarks, journal, MixtureIdentity(), MIXTURE)
-    doubtful.watches.append(seen)
+        landmarks.apply([Assignment(recorded(journal, sighting(k, [3.0, 0.1], floor=floor)), Outcome.USED, 7)], 1.0)
+    smoother.flush(1.0)
+    off = recorded(journal, sighting(2, [3.3, 0.1], 1, floor))
+    landmarks.apply([Assignment(off, Outcome.USED, 7)], 1.0)
+    seen = TrackedObject(IdentityPosterior({7: 0.9}), [off])
+    policy = MixtureIdentities(landmarks, MixtureIdentity(), GAUSSIAN)
+    policy.watches.append(seen)
     assert MIXTURE.best([seen], smoother.values, [7], landmarks.sizes()) == [None]
-    doubtful.reconsider(1.0)
+    for changes in policy.reconsider(1.0):
+        landmarks.apply(changes, 1.0)
     assert seen.landmark_id == (7 if stays else None)
-    assert journal.log().outcomes == [Outcome.USED if stays else Outcome.UNFIT]
+    assert journal.log().outcomes[2:] == [Outcome.USED if stays else Outcome.UNFIT]
+
+
+# A small world, in which all choices can be tried --------------------------------------------------------------------
+
+IDS = (7, 4, None)
+POSES = [small.world().atPose3(X(k)) for k in range(6)]
+KNOWN = graph_of(pose_prior(X(k), pose, 0.01) for k, pose in enumerate(POSES))
+
+
+def named(k: int, place: int, said: int, values: gtsam.Values) -> TrackedObject:
+    """One sighting from pose k of landmark 7 or 4, surely named."""
+    found = small.watch(values, small.PLACES[place], [k], np.zeros((1, 2)), {said: 0.9})
+    found.sightings[0].floor = FloorPrior(z_m=float(small.PLACES[place][2]), sigma_m=0.05)
+    return found
+
+
+def cost_of(policy: MixtureIdentities, values: gtsam.Values, choices: Choices) -> float:
+    """The error of the graph that was chosen, and logarithms of densities and weights; by scipy."""
+    found, sizes = policy._graph(KNOWN, policy.watches, choices).error(values), Counter(choices)
+    for seen, choice in zip(policy.watches, choices, strict=True):
+        weight, none = small.log_weights(seen.statement.probability, choice or 0)
+        if choice is None:
+            found -= none + small.LOG_U
+        elif sizes[choice] == 1:  # its landmark is where it says: of unknown place
+            found -= weight + small.LOG_U
+        else:
+            R = seen.sightings[0].noise
+            found -= weight + float(multivariate_normal.logpdf(np.zeros(2), np.zeros(2), R))
+    return float(found)
+
+
+@pytest.mark.parametrize(
+    "said",
+    [[7, 4, 7, 4, 7, 4], [7, 4, 4, 4, 7, 4], [7, 4, 7, 7, 7, 4], [7, 4, 4, 7, 7, 4]],
+    ids=["right", "a wrong 4", "a wrong 7", "exchanged"],
+)
+def test_the_choices_that_settle_are_the_cheapest_of_all(said: list[int]) -> None:
+    """Three sightings of each of two landmarks, from nothing: each begins with one, and gets the others then."""
+    places = [7, 4, 7, 4, 7, 4]
+    smoother = smoother_with()
+    for k, pose in enumerate(POSES):
+        smoother.add_pose(X(k), pose, float(k))
+        smoother.add({"prior": KNOWN.at(k)})
+    smoother.update(5.0)
+    landmarks = LandmarkGraph(
+        smoother, SightingFactors(SonarCalibration(elevation_aperture_rad=0.3), plain), DetectionJournal()
+    )
+    policy = MixtureIdentities(landmarks, MixtureIdentity(), GAUSSIAN)
+    stated = enumerate(zip(places, said, strict=True))
+    policy.watches += [named(k, place, name, small.world()) for k, (place, name) in stated]
+    found = policy._history()
+    assert found.choices == places
+    others = [list(c) for c in product(IDS, repeat=6) if list(c) != places]
+    rng, start = np.random.default_rng(0), smoother.values
+    for other in [others[k] for k in rng.choice(len(others), 60, replace=False)]:
+        worse = policy._solve(KNOWN, policy.watches, start, other)
+        assert cost_of(policy, worse, other) > cost_of(policy, found.values, places) + 1.0

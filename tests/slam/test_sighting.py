@@ -12,10 +12,10 @@ from scipy.optimize import least_squares
 
 from sonar_graph.calibration import FloorPrior, SonarCalibration
 from sonar_graph.measurements import Floats
-from sonar_graph.slam.landmarks.sighting import LandmarkSightings, Sighting, SightingFactors, place
-from sonar_graph.slam.smoother import Changed
-from sonar_graph.slam.smoother.batch_solution import Sightline
-from sonar_graph.states import DetectionJournal
+from sonar_graph.slam.landmarks.landmark_graph import Assignment, LandmarkGraph
+from sonar_graph.slam.landmarks.sighting import Sighting, SightingFactors, place
+from sonar_graph.slam.smoother import Changed, Sightline
+from sonar_graph.states import DetectionJournal, Outcome
 
 from .made import graph_of, plain, polar, pose_prior, smoother_with, values_of
 
@@ -27,7 +27,7 @@ NOISE = np.diag([0.02**2, 0.01**2])
 FLOOR = FloorPrior(z_m=-0.8, sigma_m=0.05)
 
 
-def begun() -> LandmarkSightings:
+def begun() -> LandmarkGraph:
     """Keyframes whose poses are known, and no landmark yet."""
     smoother = smoother_with(1e9, 0.1, 1e9)
     for k in range(POSES):
@@ -35,15 +35,25 @@ def begun() -> LandmarkSightings:
         smoother.add_pose(X(k), pose, float(k))
         smoother.add({"prior": pose_prior(X(k), pose, 0.01)})
     smoother.update(float(POSES))
-    return LandmarkSightings(smoother, MAKER, DetectionJournal())
+    return LandmarkGraph(smoother, MAKER, DetectionJournal())
 
 
-def sighting_of(landmark_id: int, k: int, floor: FloorPrior | None, landmarks: LandmarkSightings) -> Sighting:
+def sighting_of(landmark_id: int, k: int, floor: FloorPrior | None, landmarks: LandmarkGraph) -> Sighting:
     z = polar(landmarks.smoother.values.atPose3(X(k)), PLACES[landmark_id])
-    return Sighting(k, k, Sightline(X(k), gtsam.Pose3(), z), NOISE, floor)
+    row = landmarks.journal.record(k, landmark_id, Outcome.WAITING)
+    return Sighting(k, row, Sightline(X(k), gtsam.Pose3(), z), NOISE, floor, outcome=Outcome.WAITING)
 
 
-def errors(graph: gtsam.NonlinearFactorGraph, ids: list[int], landmarks: LandmarkSightings) -> list[float]:
+def change(landmarks: LandmarkGraph, changes: list[tuple[Sighting, int | None]]) -> None:
+    """Sightings are from now on of landmarks, or of none."""
+    later = {Outcome.WAITING: Outcome.USED_LATER}
+    landmarks.apply(
+        [Assignment(s, later.get(s.outcome, Outcome.MOVED) if i else Outcome.TAKEN_BACK, i) for s, i in changes],
+        float(POSES),
+    )
+
+
+def errors(graph: gtsam.NonlinearFactorGraph, ids: list[int], landmarks: LandmarkGraph) -> list[float]:
     rng, found = np.random.default_rng(0), []
     for _ in range(4):
         values = gtsam.Values()
@@ -66,9 +76,7 @@ def test_whatever_came_and_went_the_graph_is_that_of_what_is_left(floor: FloorPr
     landmarks = begun()
     seen, of = [sighting_of(7, k, floor, landmarks) for k in range(POSES)], dict[Sighting, int]()
     for stage in stages:
-        changed = [(s, i) for s, i in zip(seen, stage, strict=True) if s.landmark_id != i]
-        coming = [(s, i) for s, i in changed if i is not None]
-        landmarks.exchange([s for s, _ in changed], coming, float(POSES))
+        change(landmarks, [(s, i) for s, i in zip(seen, stage, strict=True) if s.landmark_id != i])
         of = {s: i for s, i in zip(seen, stage, strict=True) if i is not None}
         expected, ids = graph_of(landmarks.smoother.graph.at(k) for k in range(POSES)), sorted(set(of.values()))
         for i in ids:
@@ -77,7 +85,7 @@ def test_whatever_came_and_went_the_graph_is_that_of_what_is_left(floor: FloorPr
                 expected.push_back(graph_of(MAKER.make(s, L(i), is_first=s is mine[0]).values()))
         assert landmarks.smoother.graph.nrFactors() == expected.nrFactors()
         assert errors(landmarks.smoother.graph, ids, landmarks) == pytest.approx(errors(expected, ids, landmarks))
-        assert sorted(landmarks.ids) == landmarks.smoother.landmark_ids == ids
+        assert landmarks.ids == landmarks.smoother.landmark_ids == ids
 
 
 @pytest.mark.parametrize("earliest_first", [True, False])
@@ -86,11 +94,11 @@ def test_what_is_said_once_is_said_by_the_earliest(earliest_first: bool) -> None
     landmarks = begun()
     early, middle, late = (sighting_of(7, k, None, landmarks) for k in (0, 2, 4))
     for s in (early, middle, late) if earliest_first else (late, middle, early):
-        landmarks.exchange([], [(s, 7)], float(POSES))
+        change(landmarks, [(s, 7)])
     store = landmarks.smoother._store
     counts = [len(store.factors([s.handle])) for s in (early, middle, late)]
     assert counts == [3, 2, 2]  # first_direction beside range and azimuth
-    landmarks.exchange([early], [], float(POSES))
+    change(landmarks, [(early, None)])
     assert early.handle is None
     assert [len(store.factors([s.handle])) for s in (middle, late)] == [3, 2]
 
@@ -100,13 +108,13 @@ def test_a_landmark_whose_sightings_have_left_counts_as_one_more() -> None:
     landmarks = begun()
     first, second, third = (sighting_of(7, k, None, landmarks) for k in (0, 1, 4))
     other = sighting_of(9, 3, None, landmarks)
-    landmarks.exchange([], [(first, 7), (second, 7), (third, 7), (other, 9)], float(POSES))
+    change(landmarks, [(first, 7), (second, 7), (third, 7), (other, 9)])
     assert landmarks.sizes() == {7: 3, 9: 1}
     landmarks.follow(Changed([], set(), {X(0), X(1)}))
     assert landmarks.sizes() == {7: 2, 9: 1}
     assert landmarks.is_rooted(7)
     assert not landmarks.is_rooted(9)
-    landmarks.exchange([third, other], [], float(POSES))
+    change(landmarks, [(third, None), (other, None)])
     assert landmarks.sizes() == {7: 1}
     assert landmarks.any_sighting(7) is first
 
@@ -133,7 +141,7 @@ def test_a_point_is_that_of_least_squares(floor: FloorPrior | None):
     def residuals(p: Floats) -> Floats:
         rows = [(polar(pose, p) - z) / sigmas for pose, z in zip(poses, measured, strict=True)]
         elevation = math.asin(poses[0].transformTo(p)[2] / polar(poses[0], p)[0])
-        middle = MAKER.elevation_on(floor, poses[0], *measured[0].tolist())
+        middle = MAKER.elevation_on(floor, poses[0], measured[0])
         rows.append(np.array([(elevation - middle) / (APERTURE_RAD / math.sqrt(12))]))
         if floor:
             rows.append(np.array([(p[2] - floor.z_m) / floor.sigma_m]))

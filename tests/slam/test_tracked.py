@@ -11,14 +11,13 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from sonar_graph.calibration import FloorPrior
-from sonar_graph.measurements import NO_TRACK, LandmarkDetections
+from sonar_graph.measurements import NO_TRACK
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
-from sonar_graph.slam import RobustKernel, frontend
-from sonar_graph.slam.landmarks.tracked import of_no_landmark, once_a_track
+from sonar_graph.slam import RobustKernel
 from sonar_graph.slam.smoother import incremental as smoother_module
 from sonar_graph.slam.smoother.incremental import Smoother
-from sonar_graph.states import DetectionJournal, Outcome
+from sonar_graph.states import Outcome
 
 from .dive import CALIBRATION, NS, T0_NS, TRUSTING, UNGATED, Dive
 from .graphs import assert_same_factors, assert_same_graph, factors_of, rows_of
@@ -38,7 +37,7 @@ from .late_identities import (
     run,
     see,
 )
-from .made import counted, detected, ran, smoother_with
+from .made import counted, ran, smoother_with
 from .rail import STEP_S, rail
 
 NEARLY_4 = [0.9, 0.0, 0.0, 0.0]
@@ -101,7 +100,7 @@ def test_whatever_was_believed_before_the_graph_is_that_of_the_last_beliefs(hist
         believed.watch(number, histories[number] if number < FRAMES - 1 else last)
         known.watch(number, last)
     assert_same_factors(believed.smoother.graph, known.smoother.graph, known.smoother.values)
-    assert believed.sightings.ids == {4, 5, 7}
+    assert believed.sightings.landmarks.ids == [4, 5, 7]
     assert len(believed.outcomes) == 3 * FRAMES
     assert set(believed.outcomes) <= {Outcome.USED, Outcome.NEW, *LATE}
     ids = believed.sightings.journal.log().landmark_ids
@@ -171,8 +170,7 @@ def test_a_track_waits_for_an_identity_no_longer_than_asked(longest_wait_s, seen
         if belief:
             see(dive, after_s, belief)
     dive.keyframes.advance(T0_NS + round(seen[-1][0] * NS))
-    dive.sightings.forget()
-    assert dive.outcomes == outcomes
+    assert dive.sightings.log().outcomes == outcomes
 
 
 @pytest.mark.parametrize("lag_s", [1e9, 0.5], ids=["in the window", "left it"])
@@ -216,7 +214,7 @@ def test_a_landmark_may_begin_late_while_what_waits_makes_the_window_restart(mon
     see(dive, 0.6, SURE[6], track=5, off_m=0.3)
     assert restarts
     assert dive.outcomes[1::2] == [Outcome.USED_LATER] * 3
-    assert dive.sightings.ids == {4, 6}
+    assert dive.sightings.landmarks.ids == [4, 6]
 
 
 def test_while_sightings_wait_the_window_stays_open_for_them(monkeypatch):
@@ -238,7 +236,6 @@ POLICIES = {
     "short": {"smoother__lag_s": 1.6},
     "associate": {"identity__unknown__policy": "associate"},
     "max-mixture": {"identity__policy": "max-mixture"},
-    "gnc": {"identity__policy": "gnc"},
 }
 NODES = 10
 ROWS = len(rail(NODES)[1].ranges)
@@ -258,34 +255,17 @@ def test_a_run_is_that_without_second_rows_of_tracks(policy: str, data: st.DataO
     tracks = data.draw(st.lists(st.integers(NO_TRACK, 1), min_size=ROWS, max_size=ROWS))
     beliefs = data.draw(st.lists(st.sampled_from(BELIEFS_OF_REPEATED_TRACKS), min_size=ROWS, max_size=ROWS))
     sequence = said(tracks, beliefs)
-    heard: list[LandmarkDetections] = []
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr(frontend, "once_a_track", lambda *given: heard.append(once_a_track(*given)) or heard[-1])
-        estimator = run(sequence, 1 / STEP_S, keyframes__motion_noise_share=0.0, **POLICIES[policy])
+    estimator = run(sequence, 1 / STEP_S, keyframes__motion_noise_share=0.0, **POLICIES[policy])
     outcomes = assert_outcomes_account(estimator, sequence)
+    is_kept = np.array([outcome is not Outcome.TRACK_REPEATED for outcome in estimator.detections().outcomes])
     pairs = enumerate(zip(sequence.detections.stamps_ns.tolist(), tracks, strict=True))
     may_be_used = {(stamp_ns, track if track != NO_TRACK else -2 - row) for row, (stamp_ns, track) in pairs}
     assert outcomes[Outcome.TRACK_REPEATED] == ROWS - len(may_be_used)
-    without = replace(sequence, detections=LandmarkDetections.concatenate(heard))
+    without = replace(sequence, detections=sequence.detections.rows(is_kept))
     alone = run(without, 1 / STEP_S, keyframes__motion_noise_share=0.0, **POLICIES[policy])
     assert np.array_equal(estimator.landmarks().ids, alone.landmarks().ids)
     assert np.array_equal(estimator.landmarks().positions, alone.landmarks().positions)
     assert np.array_equal(estimator.trajectory().positions, alone.trajectory().positions)
-
-
-def test_of_a_tracks_rows_the_one_stays_that_its_identity_explains_best():
-    """Of a track that counts as nothing the most probable row, of equals the first; of one named twice the sum."""
-
-    def kept(track: list[int], beliefs: list[list[float]], identity_of, ids=IDS) -> list[int]:
-        rows = detected(0, [(1.0 + row, 0.0) for row in range(len(track))], ids, beliefs, track)
-        return (once_a_track(rows, identity_of, DetectionJournal()).range_m - 1.0).astype(int).tolist()
-
-    one = [3, 3, NO_TRACK, 8], [[0.9, 0, 0, 0], [0, 0, 0.8, 0], SURE[4], FLAT]
-    assert kept(*one, lambda _: 6) == [1, 2, 3]
-    assert kept(*one, lambda _: 4) == [0, 2, 3]
-    nothing = [3, 3, 3, NO_TRACK, NO_TRACK], [FLAT, [0, 0.8, 0, 0], [0, 0, 0.8, 0], FLAT, FLAT]
-    assert kept(*nothing, of_no_landmark) == [1, 3, 4]
-    assert kept([3, 3], [[0, 0.6, 0, 0], [0.4, 0.4, 0, 0]], lambda _: 0, [0] * 4) == [1]
 
 
 PLACES_IN_FRAME = [int(i == 7) for _, i, _ in rail(NODES)[1].ranges]

@@ -16,16 +16,14 @@ from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 from sonar_graph.slam.landmarks import unknown as module
 from sonar_graph.slam.landmarks.joint_compatibility import UNPAIRED, Innovations, Pairing, pair_jointly
-from sonar_graph.slam.landmarks.sighting import LandmarkSightings, Sighting, SightingFactors
-from sonar_graph.slam.landmarks.tracked import STILL
+from sonar_graph.slam.landmarks.landmark_graph import Assignment, LandmarkGraph
+from sonar_graph.slam.landmarks.sighting import Sighting, SightingFactors, late_view
 from sonar_graph.slam.landmarks.unknown import (
     ODDS,
-    AnonymousLandmarks,
     AssociatedUnknown,
     LandmarkMerging,
-    PairedDetection,
+    NamelessLandmarks,
 )
-from sonar_graph.slam.models.prediction import PredictedView
 from sonar_graph.slam.smoother.batch_solution import JointCovariance, Sightline
 from sonar_graph.slam.smoother.incremental import Smoother
 from sonar_graph.states import FIRST_ANONYMOUS_ID, DetectionJournal, Outcome
@@ -173,22 +171,28 @@ def test_half_named_ends_in_names_only():
 NOISE = np.diag([4e-4, 1e-4])
 
 
+def ahead(landmarks: LandmarkGraph, range_m: float, azimuth_rad: float = 0.0) -> Sighting:
+    """A sighting from the first pose."""
+    line = Sightline(X(0), gtsam.Pose3(), np.array([range_m, azimuth_rad]))
+    return Sighting(0, landmarks.journal.record(0, -1, Outcome.WAITING), line, NOISE, None)
+
+
 def anonymous(
     range_m: float, density_m2: float, least_sightings: int = 1, aperture_rad: float = 0.3
-) -> tuple[AnonymousLandmarks, Smoother]:
+) -> tuple[NamelessLandmarks, Smoother]:
     """A known pose, and a landmark straight ahead."""
     smoother = smoother_with(1e9, 0.1, 1e9)
     maker = SightingFactors(SonarCalibration(elevation_aperture_rad=aperture_rad), plain)
-    landmarks = LandmarkSightings(smoother, maker, DetectionJournal())
+    landmarks = LandmarkGraph(smoother, maker, DetectionJournal())
     smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
     smoother.add({"prior": pose_prior(X(0), gtsam.Pose3(), 1e-4)})
     smoother.update(0.0)
-    sighting = Sighting(0, 0, Sightline(X(0), gtsam.Pose3(), np.array([range_m, 0.0])), NOISE, None)
-    landmarks.exchange([], [(sighting, 7)], 0.0)
+    landmarks.apply([Assignment(ahead(landmarks, range_m), Outcome.USED, 7)], 0.0)
+    smoother.flush(0.0)
     policy = AssociatedUnknown(
         gate_probability=0.99, density_m2=density_m2, sightings=least_sightings, longest_wait_s=60.0
     )
-    return AnonymousLandmarks(landmarks, DetectionJournal(), policy), smoother
+    return NamelessLandmarks(landmarks, None, policy), smoother
 
 
 @pytest.mark.parametrize("range_m", [0.5, 2.0, 8.0])
@@ -197,7 +201,8 @@ def test_a_landmark_has_to_be_denser_than_what_is_not_in_the_map(range_m: float,
     """So many a square metre are ``range`` times as many a metre of range and radian of azimuth."""
     z = np.array([range_m + 0.02, 0.01])
     _, smoother = anonymous(range_m, 1.0)
-    view = PredictedView(X(0), None, gtsam.Pose3(), STILL, gtsam.Pose3(), smoother.joint_covariance([X(0), L(7)]))
+    sighting = Sighting(0, 0, Sightline(X(0), gtsam.Pose3(), z), NOISE, None)
+    view = late_view(sighting, smoother.values, smoother.joint_covariance([X(0), L(7)]))
     expected, cov = view.expect([L(7)], smoother.values.atPoint3(L(7))[None])
     density = multivariate_normal.pdf(z, expected[0], cov[0] + NOISE)
     policied, _ = anonymous(range_m, share * density / (ODDS * z[0]))
@@ -211,8 +216,7 @@ def test_a_candidate_begins_a_landmark_when_it_is_known_to_a_tenth_of_its_range(
     """One sighting in an aperture whose standard deviation is about 0.1 rad."""
     made, _ = anonymous(range_m, 1e-3, aperture_rad=share * 0.1 * math.sqrt(12.0))
     sighting = Sighting(1, 1, Sightline(X(0), gtsam.Pose3(), np.array([range_m, 0.4])), NOISE, None)
-    made.use([sighting], [PairedDetection(None, None)], 0.0)
-    assert sighting.outcome is (Outcome.NEW if share < 1.0 else Outcome.WAITING)
+    assert made.is_placed([sighting]) == (share < 1.0)
 
 
 PROBABILITY = 0.99
@@ -230,14 +234,14 @@ def nearest(
 ) -> tuple[int, int] | None:
     """Of landmarks at points with a joint covariance, each seen in some frames; rooted ones also before the window."""
     smoother = smoother_with(1e9, 0.1, 1e9)
-    landmarks = LandmarkSightings(smoother, SightingFactors(SonarCalibration(), plain), DetectionJournal())
+    landmarks = LandmarkGraph(smoother, SightingFactors(SonarCalibration(), plain), DetectionJournal())
     values = gtsam.Values()
     for (i, point), range_m in zip(points.items(), ranges_m, strict=True):
         values.insert(L(i), np.array(point))
         for stamp_ns in frames[i]:
             noise = np.diag([NOISE_M**2, (NOISE_M / 2) ** 2])
             sighting = Sighting(stamp_ns, 0, Sightline(X(0), gtsam.Pose3(), np.array([range_m, 0.0])), noise, None)
-            landmarks._enter(sighting, i, None)
+            landmarks._put(sighting, i, None)
         if i in rooted:
             landmarks._rooted[i] = sighting
     joint = JointCovariance(cov, {L(i): 3 * k for k, i in enumerate(points)})

@@ -13,6 +13,7 @@ with the density u over range and azimuth, 1/(m rad) (docs/theory/doubtful_ident
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 
@@ -21,7 +22,7 @@ from pydantic import Field
 from scipy.stats import chi2
 
 from sonar_graph.calibration import Section
-from sonar_graph.measurements import Floats, Ints, LandmarkDetections
+from sonar_graph.measurements import NO_TRACK, Floats, Ints, LandmarkDetections
 from sonar_graph.states import Outcome
 
 
@@ -58,6 +59,44 @@ def identify(detections: LandmarkDetections, minimum_probability: float) -> Iden
             best[place] = row
     once = [why if why or best[places[row]] == row else Outcome.REPEATED for row, why in enumerate(refusals)]
     return Identities(ids, once)
+
+
+UNDECIDED, NO_LANDMARK = -2, -1
+"""Decisions of a row besides a landmark's identity."""
+
+
+def decide(frame: LandmarkDetections, least_probability: float) -> list[int]:
+    """Decision of each row: a landmark's identity, `NO_LANDMARK` or `UNDECIDED`."""
+    ids, probability = frame.most_probable()
+    none = 1.0 - frame.id_probability.sum(axis=1)
+    return [
+        landmark_id
+        if p >= least_probability and landmark_id >= 0
+        else (NO_LANDMARK if missing >= least_probability else UNDECIDED)
+        for landmark_id, p, missing in zip(ids.tolist(), probability.tolist(), none.tolist(), strict=True)
+    ]
+
+
+def second_rows_of_tracks(frame: LandmarkDetections, identities: Mapping[int, int]) -> list[Outcome | None]:
+    """Refusals of the rows of a frame that show an object a second time; None: the row stays.
+
+    A track is one object in one place, so each frame keeps one row of it: that with the highest posterior for the
+    landmark that the track counts as, by its number; of others, the one with the highest posterior for any landmark; of
+    equals the first.
+    """
+    tracks = frame.track.tolist()
+    best: dict[int, tuple[float, float, int]] = {}
+    for row, track in enumerate(tracks):
+        if track != NO_TRACK:
+            is_landmark = frame.candidate_ids[row] >= 0
+            ids, posterior = frame.candidate_ids[row, is_landmark], frame.id_probability[row, is_landmark]
+            of_it = float(posterior[ids == identities.get(track, UNDECIDED)].sum())
+            score = of_it, float(posterior.max(initial=0.0)), -row
+            best[track] = max(best.get(track, score), score)
+    return [
+        None if track == NO_TRACK or -best[track][2] == row else Outcome.TRACK_REPEATED
+        for row, track in enumerate(tracks)
+    ]
 
 
 @cache

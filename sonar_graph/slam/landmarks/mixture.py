@@ -27,8 +27,6 @@ from sonar_graph.slam.landmarks.association import IdentityPosterior, Recogniser
 from sonar_graph.slam.landmarks.sighting import Sighting
 from sonar_graph.slam.models import Kernel
 
-LEAST_TRUNCATION = 1.0
-"""Of the squared error, where even a perfect fit is less probable than none."""
 REPEATED_LOSS = 3.0
 """Mean loss, twice or thrice what noise alone gives, to which sightings of one thing that stands still agree."""
 
@@ -119,24 +117,6 @@ class Mixture:
         fits = self._fits(watches, points, values)
         weights = np.array([watch.statement.log_weights([landmark_id], self._errors) for watch in watches])
         return np.asarray(fits - self._unplaced(watches)[:, None] + (weights[:, 0] - weights[:, 1])[:, None])
-
-    def squared_errors(self, watches: list[TrackedObject], ids: list[int], values: gtsam.Values) -> Floats:
-        """Squared error of each tracked object, summed over its sightings, as of the given landmark, shape (n,)."""
-        squares = []
-        errors = Errors([s for watch in watches for s in watch.sightings], values)
-        keys = sorted(set(ids))
-        points = np.array([values.atPoint3(L(i)) for i in keys]).reshape(-1, 3)
-        column = np.repeat([keys.index(i) for i in ids], [len(watch.sightings) for watch in watches])
-        squares = (errors.of(points)[np.arange(len(column)), column] ** 2).sum(axis=1)
-        return np.asarray(np.add.reduceat(squares, _starts(watches)))
-
-    def truncations(self, watches: list[TrackedObject]) -> Floats:
-        """Squared error at which each object is as probably no landmark as the one that it names, shape (n,)."""
-        weights = [w.statement.log_weights([w.statement.favourite or 0], self._errors) for w in watches]
-        gains = np.array(
-            [self._peaks(w).sum() + named - none for w, (named, none) in zip(watches, weights, strict=True)]
-        )
-        return np.maximum(2.0 * (gains - self._unplaced(watches)), LEAST_TRUNCATION)
 
     def _peaks(self, watch: TrackedObject) -> Floats:
         """Log density of each sighting where it fits perfectly, shape (n,)."""

@@ -1,9 +1,9 @@
-"""Max-mixture of identities, incrementally: choices made again as the estimate moves (doubtful_identities.md).
+"""Max-mixture of identities: choices made again as the estimate moves (docs/theory/doubtful_identities.md).
 
 A tracked object is all sightings of one track, or one sighting of no track. Its components are the landmarks that it
 may be, and none. The chosen component has its factors in the graph, the others have none; a Gauss-Newton step of that
 graph is one of the max-mixture. After every update the choices of the window are made anew until none changes. For
-smoothed results the choices of the whole history are made anew too, beside the run.
+smoothed results the choices of the whole history are made anew too, beside the run, which they leave as it is.
 
 When a detection comes, the state is not yet conditioned on it. It is then weighed by its predictive density, with the
 innovation covariance ``S = H P H' + R``: a vehicle that has drifted must not mistake its landmarks for none.
@@ -11,137 +11,103 @@ innovation covariance ``S = H P H' + R``: a vehicle that has drifted must not mi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated, Literal
+from collections import defaultdict
+from collections.abc import Iterator, Set
+from typing import Annotated, Literal, NamedTuple
 
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import L
 from pydantic import Field
 
-from sonar_graph.measurements import NO_TRACK, Floats
-from sonar_graph.slam.landmarks.association import IdentityPosterior, RecogniserErrors
-from sonar_graph.slam.landmarks.mixture import Choices, Mixture, TrackedObject, each_once, supporters_elsewhere
-from sonar_graph.slam.landmarks.mixture_history import RivalHistory
-from sonar_graph.slam.landmarks.sighting import LandmarkSightings, Sighting
-from sonar_graph.slam.landmarks.tracked import NS_PER_S, STILL, GatedIdentity, RobustIdentity
-from sonar_graph.slam.models import PredictedView
-from sonar_graph.states import DetectionJournal, DetectionLog, Outcome
+from sonar_graph.measurements import NO_TRACK, LandmarkDetections
+from sonar_graph.slam.estimates import Solution
+from sonar_graph.slam.landmarks.association import IdentityPosterior, RecogniserErrors, second_rows_of_tracks
+from sonar_graph.slam.landmarks.landmark_graph import Assignment, LandmarkGraph
+from sonar_graph.slam.landmarks.mixture import Choices, Mixture, Scores, TrackedObject, each_once, supporters_elsewhere
+from sonar_graph.slam.landmarks.sighting import SeenFrame, Sighting, late_view
+from sonar_graph.slam.landmarks.tracked import NS_PER_S, GatedIdentity, RobustIdentity
+from sonar_graph.slam.models import Kernel
+from sonar_graph.slam.smoother import marginals_of, solve_in_sight
+from sonar_graph.states import Outcome
 from sonar_graph.tagged_sections import tagged
 
-MOST_ROUNDS = 3
-"""Times that choices are made anew after one update."""
+MOST_WINDOW_ROUNDS, MOST_HISTORY_ROUNDS = 3, 10
+"""Times that choices are made anew, after one update and for one smoothed result."""
 MOST_OPEN = 200
-"""Number of newest tracked objects that are chosen anew."""
+"""Number of newest tracked objects that are chosen anew in the window."""
 
 
 class MixtureIdentity(RecogniserErrors):
     """Choose for each track, or single detection, the landmark, or none, that posterior and place make most probable.
 
-    "max-mixture": the choice is made anew in the window as the estimate moves, and in the whole history for smoothed
-    results. Assumes independent errors at the rate `wrong_id_probability`, and an estimate near the truth when it
-    chooses. "gnc": smoothed results also try the solution of graduated non-convexity over the whole history, which
-    needs no good estimate to begin with; assumes that most identities stated by the recogniser are right.
+    The choice is made anew in the window as the estimate moves, and in the whole history for smoothed results. Assumes
+    independent errors at the rate `wrong_id_probability`, and an estimate near the truth when it chooses.
     """
 
-    policy: Literal["max-mixture", "gnc"] = "max-mixture"
+    policy: Literal["max-mixture"] = "max-mixture"
     longest_wait_s: float = Field(60.0, gt=0)
     """Longest time for which detections of a track wait in the window. A track that is not seen for this time ends."""
 
 
 IdentityParams = Annotated[RobustIdentity | GatedIdentity | MixtureIdentity, *tagged("policy", "robust")]
+Changes = list[tuple[TrackedObject, int | None]]
+"""Tracked objects with the landmark that each is to count as; None: no landmark."""
 
 
-class DoubtfulIdentities:
-    """Keeps the graph in line with the best component of every tracked object."""
+class ChosenHistory(NamedTuple):
+    """Solution of the whole history with the choices that suit it best."""
 
-    def __init__(
-        self, landmarks: LandmarkSightings, journal: DetectionJournal, params: MixtureIdentity, mixture: Mixture
-    ) -> None:
-        self._landmarks = landmarks
-        self._smoother, self._maker = landmarks.smoother, landmarks.maker
-        self._journal = journal
-        self._mixture = mixture
+    values: gtsam.Values
+    marginals: gtsam.Marginals | gtsam.ISAM2
+    watches: list[TrackedObject]
+    choices: Choices
+    """Choice for each tracked object."""
+
+
+class MixtureIdentities:
+    """Policy "max-mixture": keeps the graph in line with the best component of every tracked object."""
+
+    def __init__(self, landmarks: LandmarkGraph, params: MixtureIdentity, kernel: Kernel) -> None:
+        self._landmarks, self._smoother = landmarks, landmarks.smoother
+        self.mixture = Mixture(params, kernel)
         self._longest_wait_ns = round(params.longest_wait_s * NS_PER_S)
-        self._is_graduated = params.policy == "gnc"
         self._tracks: dict[int, TrackedObject] = {}
         self._disputed: set[int] = set()
-        self._chosen: ChosenHistory | None = None
-        self._chosen_from: gtsam.Values | None = None
+        self._chosen: tuple[gtsam.Values, int, ChosenHistory] | None = None
         self.watches: list[TrackedObject] = []
         """All tracked objects in the order in which they began."""
 
-    @property
-    def keys(self) -> list[int]:
-        """Keys of the landmarks in the graph."""
-        return [L(i) for i in sorted(self._landmarks.ids)]
+    def screen(self, frame: LandmarkDetections) -> list[Outcome | None]:
+        """Refuse second rows of tracks."""
+        return second_rows_of_tracks(frame, {})
 
-    def chosen_at_first(
-        self, view: PredictedView, statements: list[IdentityPosterior], tracks: list[int], z: Floats, noise: Floats
-    ) -> list[int | None]:
-        """Choose the landmark of each detection of a frame; that of a known track is the track's.
+    def assign(self, frame: SeenFrame) -> Iterator[list[Assignment]]:
+        """The frame's sightings, with what waited in their tracks; then others as the estimate moves.
 
-        Parameters
-        ----------
-        z, noise
-            Range (m) and azimuth (rad), shape (m, 2), and their covariance, shape (m, 2, 2).
+        The detection of a known track is of its landmark. Tracks that are over are forgotten; keyframes on which
+        sightings of others wait are held in the window.
         """
-        ids = sorted(self._landmarks.ids)
-        points = np.array([self._smoother.values.atPoint3(L(i)) for i in ids]).reshape(-1, 3)
-        expected, cov = view.expect(self.keys, points)
-        scores = [
-            self._mixture.at_first(statement, ids, z[row], expected, cov + noise[row])
-            for row, statement in enumerate(statements)
-        ]
-        for row, track in enumerate(tracks):
-            watch = self._tracks.get(track) if track != NO_TRACK else None
-            if watch is not None and watch.landmark_id is not None:
-                scores[row] = {watch.landmark_id: np.inf}
-        return each_once(scores, [{0}] * len(scores))
-
-    def enter(
-        self,
-        statements: list[IdentityPosterior],
-        tracks: list[int],
-        sightings: list[Sighting],
-        chosen: list[int | None],
-        time_s: float,
-    ) -> None:
-        """Put a frame's sightings into the graph as chosen, with what waited in their tracks.
-
-        Tracks that are over are forgotten; keyframes on which sightings of others wait are held in the window.
-        """
-        late: list[tuple[Sighting, int]] = []
-        for statement, track, sighting, landmark_id in zip(statements, tracks, sightings, chosen, strict=True):
-            known = self._tracks.get(track) if track != NO_TRACK else None
-            watch = known or TrackedObject(statement)
-            watch.statement = statement
-            if known is None:
-                self.watches.append(watch)
-                if track != NO_TRACK:
-                    self._tracks[track] = watch
-            waiting = [s for s in watch.sightings if s.outcome is Outcome.UNFIT] if track != NO_TRACK else []
-            watch.sightings.append(sighting)
-            if landmark_id != statement.favourite and statement.favourite is not None:
-                self._disputed.add(statement.favourite)
-            if landmark_id is None:
-                sighting.outcome = Outcome.UNFIT
-                continue
-            is_first = landmark_id not in self._landmarks
-            sighting.outcome = Outcome.NEW if is_first else _used(statement, landmark_id, Outcome.USED)
-            if is_first:
-                self._smoother.add_landmark(L(landmark_id), self._maker.place(sighting, self._smoother.values))
-            self._landmarks.add(sighting, landmark_id, is_first=is_first)
-            taken_ns = self._landmarks.stamps_ns(landmark_id)
-            fresh = [s for s in waiting if s.stamp_ns not in taken_ns]
-            for waited in fresh:
-                waited.outcome = _used(statement, landmark_id, Outcome.USED_LATER)
-            late += [(waited, landmark_id) for waited in fresh]
-        if late:
-            self._landmarks.exchange([], late, time_s)
-        for sighting, landmark_id in late:
-            self._journal.amend(sighting.row, sighting.outcome, landmark_id)
-        oldest_ns = sightings[0].stamp_ns - self._longest_wait_ns
+        rows, tracks = list(range(len(frame.rows))), frame.detections.track.tolist()
+        statements = [IdentityPosterior.of(frame.detections, row) for row in rows]
+        ids = self._landmarks.ids
+        keys = [L(i) for i in ids]
+        view = frame.predict(keys)
+        points = np.array([self._smoother.values.atPoint3(key) for key in keys]).reshape(-1, 3)
+        expected, cov = view.expect(keys, points)
+        scores: list[Scores] = []
+        for row, said in enumerate(statements):
+            known = self._tracks.get(tracks[row])
+            if known is not None and known.landmark_id is not None:
+                scores.append({known.landmark_id: np.inf})
+            else:
+                scores.append(self.mixture.at_first(said, ids, frame.z[row], expected, cov + frame.noise[row]))
+        chosen = each_once(scores, [{0}] * len(scores))
+        assigned: list[Assignment] = []
+        for row, sighting in enumerate(frame.sightings(view, rows)):
+            assigned += self._enter(statements[row], tracks[row], sighting, chosen[row])
+        yield assigned
+        oldest_ns = frame.stamp_ns - self._longest_wait_ns
         self._tracks = {k: watch for k, watch in self._tracks.items() if watch.sightings[-1].stamp_ns >= oldest_ns}
         self._smoother.hold(
             {
@@ -152,61 +118,77 @@ class DoubtfulIdentities:
                 if sighting.stamp_ns >= oldest_ns
             }
         )
+        yield from self.reconsider(frame.keyframes.newest_s)
 
-    def reconsider(self, time_s: float) -> None:
+    def _enter(
+        self, said: IdentityPosterior, track: int, sighting: Sighting, chosen: int | None
+    ) -> Iterator[Assignment]:
+        """One sighting as chosen, and what waited in its track."""
+        watch = self._tracks.get(track)
+        if watch is None:
+            watch = TrackedObject(said)
+            self.watches.append(watch)
+            if track != NO_TRACK:
+                self._tracks[track] = watch
+        waiting = [s for s in watch.sightings if s.outcome is Outcome.UNFIT]
+        watch.statement = said
+        watch.sightings.append(sighting)
+        if said.favourite not in (None, chosen):
+            self._disputed.add(said.favourite)
+        if chosen is None:
+            yield Assignment(sighting, Outcome.UNFIT, -1 if said.favourite is None else said.favourite)
+            return
+        at_once = Outcome.USED if chosen in self._landmarks else Outcome.NEW
+        is_as_said = at_once is Outcome.NEW or chosen == said.favourite
+        yield Assignment(sighting, at_once if is_as_said else Outcome.REASSIGNED, chosen)
+        taken_ns = self._landmarks.stamps_ns(chosen) | {sighting.stamp_ns}
+        yield from (Assignment(s, *late_outcome(said, chosen)) for s in waiting if s.stamp_ns not in taken_ns)
+
+    def reconsider(self, now_s: float) -> Iterator[list[Assignment]]:
         """Choose anew in the window until nothing changes; move landmarks to where their sightings agree."""
         watches = self._open()
-        if self._changes(watches, self._smoother.values):
-            self._landmarks.follow(self._smoother.flush(time_s))
-            self._smoother.settle(time_s)  # a step of a robust kernel may end far from where the choices are to be made
-        for _ in range(MOST_ROUNDS):
+        if self._changes(watches):
+            self._landmarks.follow(self._smoother.flush(now_s))
+            self._smoother.settle(now_s)  # a step of a robust kernel may end far from where the choices are to be made
+        for _ in range(MOST_WINDOW_ROUNDS):
             changes = [
                 (watch, new)
-                for watch, new in self._changes(watches, self._smoother.values)
+                for watch, new in self._changes(watches)
                 if watch.landmark_id is None or self._is_alone(watch) or self._is_preferred(new, watch)
             ]
             if not changes:
                 break
-            self._change(changes, time_s)
-        for landmark_id in sorted(self._disputed & self._landmarks.ids):
+            yield self._change(changes)
+        for landmark_id in sorted(self._disputed.intersection(self._landmarks.ids)):
             naming = [watch for watch in self.watches if watch.statement.favourite == landmark_id]
             present = [watch.landmark_id for watch in naming]
-            found = supporters_elsewhere(landmark_id, naming, present, self._smoother.values, self._mixture)
+            found = supporters_elsewhere(landmark_id, naming, present, self._smoother.values, self.mixture)
             if found is not None:
-                self._change([(w, None) for w in self.watches if w.landmark_id == landmark_id], time_s)
-                self._change([(w, landmark_id) for w in found], time_s)
+                yield self._change([(w, None) for w in self.watches if w.landmark_id == landmark_id])
+                yield self._change([(w, landmark_id) for w in found])
         self._disputed.clear()
 
-    def history(self) -> ChosenHistory:
-        """Choose anew in the whole history until nothing changes; the window's choices stay as they are."""
-        values, marginals = self._smoother.solve_history()
-        heard = sum(len(watch.sightings) for watch in self.watches)
-        if self._chosen is None or self._chosen_from is not values or self._chosen.heard != heard:
-            watches = [
-                watch
-                for watch in self.watches
-                if watch.landmark_id is not None or all(s.outcome is not Outcome.WITHHELD for s in watch.sightings)
-            ]
-            present = [watch.landmark_id for watch in watches]
-            handles = {s.handle for watch in watches for s in watch.sightings if s.handle is not None}
-            rival = RivalHistory(self._smoother.graph_without(handles), watches, self._mixture, self._maker)
-            found, choices = rival.settled(values, present, is_graduated=self._is_graduated)
-            if found is not values:
-                marginals = rival.marginals(found, choices)
-            self._chosen_from, self._chosen = values, ChosenHistory(found, marginals, watches, choices, heard)
-        return self._chosen
+    def forget(self, now_ns: int, left: Set[int] = frozenset()) -> list[Assignment]:  # noqa: ARG002
+        """Nothing is forgotten: it may be chosen anew in the whole history."""
+        return []
 
-    def log(self) -> DetectionLog:
-        """Outcome of each detection in the whole history."""
-        journal, chosen = self._journal.copy(), self.history()
-        for watch, new in _differing(chosen.watches, chosen.choices):
-            for sighting in watch.sightings:
-                journal.amend(sighting.row, *late_outcome(watch.statement, new))
-        return journal.log()
+    def smoothed(self) -> Solution:
+        """Solution of the whole graph with the choices that suit it best."""
+        chosen = self._history()
+        return Solution(chosen.values, chosen.marginals, sorted({i for i in chosen.choices if i is not None}))
 
-    def _changes(self, watches: list[TrackedObject], values: gtsam.Values) -> list[tuple[TrackedObject, int | None]]:
-        best = self._mixture.best(watches, values, [watch.landmark_id for watch in watches], self._landmarks.sizes())
-        return _differing(watches, best)
+    def rechosen(self) -> list[Assignment]:
+        """Assignments of the whole history that are not those of the window."""
+        chosen = self._history()
+        return _assigned(_differing(chosen.watches, chosen.choices))
+
+    def _changes(self, watches: list[TrackedObject]) -> Changes:
+        values, sizes = self._smoother.values, self._landmarks.sizes()
+        return _differing(watches, self.mixture.best(watches, values, [w.landmark_id for w in watches], sizes))
+
+    def _change(self, changes: Changes) -> list[Assignment]:
+        self._disputed |= {w.statement.favourite for w, new in changes if w.statement.favourite not in (None, new)}
+        return _assigned(changes)
 
     def _open(self) -> list[TrackedObject]:
         """Objects to choose anew: tracks whose statement contradicts their present choice, and objects in the window.
@@ -240,54 +222,100 @@ class DoubtfulIdentities:
         """
         sighting, values = watch.sightings[-1], self._smoother.values
         ids = [i for i in (watch.landmark_id, new) if i is not None and i in self._landmarks]
-        line, keys = sighting.line, [L(i) for i in ids]
-        joint = self._smoother.joint_covariance_of_any([line.pose_key, *keys])
-        view = PredictedView(line.pose_key, None, values.atPose3(line.pose_key), STILL, line.body_T_sonar, joint)
+        keys = [L(i) for i in ids]
+        view = late_view(sighting, values, self._smoother.joint_covariance_of_any([sighting.line.pose_key, *keys]))
         expected, cov = view.expect(keys, np.array([values.atPoint3(key) for key in keys]))
-        scores = self._mixture.at_first(watch.statement, ids, line.z, expected, cov + sighting.noise)
+        scores = self.mixture.at_first(watch.statement, ids, sighting.line.z, expected, cov + sighting.noise)
         return scores[new] > scores[watch.landmark_id]
 
-    def _change(self, changes: list[tuple[TrackedObject, int | None]], time_s: float) -> None:
-        leaving = [s for watch, _ in changes for s in watch.sightings if s.landmark_id is not None]
-        coming = [(s, new) for watch, new in changes if new is not None for s in watch.sightings]
-        for watch, new in changes:
-            said = watch.statement.favourite
-            if said is not None and new != said:
-                self._disputed.add(said)
-            for sighting in watch.sightings:
-                sighting.outcome, landmark_id = late_outcome(watch.statement, new)
-                self._journal.amend(sighting.row, sighting.outcome, landmark_id)
-        self._landmarks.exchange(leaving, coming, time_s)
+    def _history(self) -> ChosenHistory:
+        """Choose anew in the whole history until nothing changes."""
+        solved, marginals = self._smoother.solve_history()
+        heard = sum(len(watch.sightings) for watch in self.watches)
+        if self._chosen is None or self._chosen[0] is not solved or self._chosen[1] != heard:
+            watches = [
+                watch
+                for watch in self.watches
+                if watch.landmark_id is not None or all(s.outcome is not Outcome.WITHHELD for s in watch.sightings)
+            ]
+            handles = {s.handle for watch in watches for s in watch.sightings if s.handle is not None}
+            rest, values = self._smoother.graph_without(handles), solved
+            choices = [watch.landmark_id for watch in watches]
+            for _ in range(MOST_HISTORY_ROUNDS):
+                start, better = values, self.mixture.best(watches, values, choices, _sizes(watches, choices))
+                if better == choices:
+                    start, better = self._relocated(watches, values, choices)
+                if better == choices:
+                    break
+                values, choices = self._solve(rest, watches, start, better), better
+            if values is not solved:
+                marginals = marginals_of(self._graph(rest, watches, choices), values)
+            self._chosen = solved, heard, ChosenHistory(values, marginals, watches, choices)
+        return self._chosen[2]
 
+    def _relocated(
+        self, watches: list[TrackedObject], values: gtsam.Values, choices: Choices
+    ) -> tuple[gtsam.Values, Choices]:
+        """Landmarks that began with something else begin where those that name them agree that they are."""
+        moved = gtsam.Values(values)
+        for landmark_id in sorted(_sizes(watches, choices)):
+            rows = [row for row, watch in enumerate(watches) if watch.statement.favourite == landmark_id]
+            naming, now = [watches[row] for row in rows], [choices[row] for row in rows]
+            found = supporters_elsewhere(landmark_id, naming, now, values, self.mixture)
+            if found is not None:
+                without = [None if choice == landmark_id else choice for choice in choices]
+                choices = [landmark_id if w in found else c for w, c in zip(watches, without, strict=True)]
+                first = min((s for watch in found for s in watch.sightings), key=lambda s: (s.stamp_ns, s.row))
+                moved.update(L(landmark_id), self._landmarks.factors.place(first, values))
+        return moved, choices
 
-@dataclass(frozen=True, eq=False)
-class ChosenHistory:
-    """Solution of the whole history with the choices that suit it best."""
+    def _solve(
+        self, rest: gtsam.NonlinearFactorGraph, watches: list[TrackedObject], values: gtsam.Values, choices: Choices
+    ) -> gtsam.Values:
+        """Solution of the history in which each tracked object is the landmark chosen for it."""
+        lines, start = defaultdict(list), gtsam.Values(values)
+        for watch, choice in zip(watches, choices, strict=True):
+            if choice is not None:
+                for sighting in watch.sightings:
+                    lines[L(choice)].append(sighting.line)
+                if not start.exists(L(choice)):
+                    start.insert(L(choice), self._landmarks.factors.place(watch.sightings[0], values))
+        return solve_in_sight(self._graph(rest, watches, choices), start, lines)
 
-    values: gtsam.Values
-    marginals: gtsam.Marginals | gtsam.ISAM2
-    watches: list[TrackedObject]
-    choices: Choices
-    """Choice for each tracked object."""
-    heard: int
-    """Number of sightings from which it was chosen."""
-
-    @property
-    def ids(self) -> set[int]:
-        """Landmarks that are seen in it, by identity."""
-        return {choice for choice in self.choices if choice is not None}
+    def _graph(
+        self, rest: gtsam.NonlinearFactorGraph, watches: list[TrackedObject], choices: Choices
+    ) -> gtsam.NonlinearFactorGraph:
+        graph = gtsam.NonlinearFactorGraph(rest)
+        of: dict[int, list[Sighting]] = defaultdict(list)
+        for watch, landmark_id in zip(watches, choices, strict=True):
+            if landmark_id is not None:
+                of[landmark_id] += watch.sightings
+        for landmark_id, sightings in of.items():
+            for k, sighting in enumerate(sorted(sightings, key=lambda sighting: (sighting.stamp_ns, sighting.row))):
+                for factor in self._landmarks.factors.make(sighting, L(landmark_id), is_first=k == 0).values():
+                    graph.push_back(factor)
+        return graph
 
 
 def late_outcome(statement: IdentityPosterior, new: int | None) -> tuple[Outcome, int | None]:
     """Outcome of detections whose landmark is chosen late, and the landmark for the journal."""
     if new is None:
         return Outcome.UNFIT, statement.favourite
-    return _used(statement, new, Outcome.USED_LATER), new
+    return Outcome.USED_LATER if new == statement.favourite else Outcome.REASSIGNED, new
 
 
-def _used(statement: IdentityPosterior, landmark_id: int, as_said: Outcome) -> Outcome:
-    return as_said if landmark_id == statement.favourite else Outcome.REASSIGNED
+def _assigned(changes: Changes) -> list[Assignment]:
+    return [Assignment(s, *late_outcome(watch.statement, new)) for watch, new in changes for s in watch.sightings]
 
 
-def _differing(watches: list[TrackedObject], choices: Choices) -> list[tuple[TrackedObject, int | None]]:
+def _differing(watches: list[TrackedObject], choices: Choices) -> Changes:
     return [(watch, new) for watch, new in zip(watches, choices, strict=True) if new != watch.landmark_id]
+
+
+def _sizes(watches: list[TrackedObject], choices: Choices) -> dict[int, int]:
+    """Number of sightings of each chosen landmark."""
+    sizes: dict[int, int] = defaultdict(int)
+    for watch, choice in zip(watches, choices, strict=True):
+        if choice is not None:
+            sizes[choice] += len(watch.sightings)
+    return sizes

@@ -3,32 +3,32 @@
 Sightings of a track wait, each on the keyframe at which it was made, until the track is known to be of a landmark; then
 all become factors there. When the track turns out to be of another landmark, or of none, its factors are taken out of
 the graph; those of the other landmark are put in once the estimate no longer rests on the wrong ones.
-
-A track is one object in one place, so each frame keeps one row of it. If the track counts as a landmark, that is the
-row with the highest posterior for this landmark; otherwise the row with the highest posterior for any landmark. If
-several rows are equal, the first is kept.
 """
 
 import math
-from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Iterator, Set
 from dataclasses import dataclass, field
 from typing import Literal
 
-import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import L
 from pydantic import Field
 
 from sonar_graph.calibration import Section
 from sonar_graph.measurements import NO_TRACK, LandmarkDetections
-from sonar_graph.navigation import PreintegratedMotion
-from sonar_graph.slam.landmarks.association import gate_threshold
-from sonar_graph.slam.landmarks.sighting import LandmarkSightings, Sighting
-from sonar_graph.slam.landmarks.unknown import IgnoredUnknown, UnknownParams
-from sonar_graph.slam.models import PredictedView
-from sonar_graph.slam.smoother import Smoother
-from sonar_graph.states import DetectionJournal, Outcome
+from sonar_graph.slam.estimates import Solution
+from sonar_graph.slam.landmarks.association import (
+    NO_LANDMARK,
+    UNDECIDED,
+    decide,
+    gate_threshold,
+    identify,
+    second_rows_of_tracks,
+)
+from sonar_graph.slam.landmarks.landmark_graph import Assignment, LandmarkGraph
+from sonar_graph.slam.landmarks.sighting import SeenFrame, Sighting, beam_point, late_view
+from sonar_graph.slam.landmarks.unknown import IgnoredUnknown, NamelessLandmarks, UnknownParams, unnamed
+from sonar_graph.states import Outcome
 
 
 class TrackedIdentity(Section):
@@ -77,21 +77,7 @@ class GatedIdentity(TrackedIdentity):
         return gate_threshold(self.gate_probability, 2) if self.gate_probability < 1 else math.inf
 
 
-UNDECIDED, NO_LANDMARK = -2, -1
-"""Decisions of a row besides a landmark's identity."""
 NS_PER_S = 1_000_000_000
-
-
-def decide(frame: LandmarkDetections, least_probability: float) -> list[int]:
-    """Decision of each row: a landmark's identity, `NO_LANDMARK` or `UNDECIDED`."""
-    ids, probability = frame.most_probable()
-    none = 1.0 - frame.id_probability.sum(axis=1)
-    return [
-        landmark_id
-        if p >= least_probability and landmark_id >= 0
-        else (NO_LANDMARK if missing >= least_probability else UNDECIDED)
-        for landmark_id, p, missing in zip(ids.tolist(), probability.tolist(), none.tolist(), strict=True)
-    ]
 
 
 @dataclass(eq=False)
@@ -107,196 +93,180 @@ class Track:
     settled: list[Sighting] = field(default_factory=list)
     """Sightings used, or refused, as sightings of that landmark."""
 
-
-STILL = PreintegratedMotion(
-    gtsam.Pose3(), np.zeros((6, 6)), np.zeros((6, 3)), np.zeros(3), 0.0, mean_specific_force=np.full(3, np.nan)
-)
-"""No motion: a sighting contains that between keyframe and sonar already."""
-
-
-def inside_gate(smoother: Smoother, threshold: float, sightings: list[Sighting], landmark_id: int) -> list[bool]:
-    """Flags of late sightings within a squared Mahalanobis distance of a landmark, from keyframes as estimated now.
-
-    One by one, as those that come at once; all pass where the landmark is not in the graph.
-    """
-    key, values = L(landmark_id), smoother.values
-    if not np.isfinite(threshold) or not sightings or not values.exists(key):
-        return [True] * len(sightings)
-    joint = smoother.joint_covariance_of_any([key, *{sighting.line.pose_key for sighting in sightings}])
-    points = values.atPoint3(key)[None]
-    distances = []
-    for sighting in sightings:
-        line = sighting.line
-        view = PredictedView(line.pose_key, None, values.atPose3(line.pose_key), STILL, line.body_T_sonar, joint)
-        found = view.compare([key], points, line.z[None], sighting.noise[None])
-        distances.append(float(found.distance[0]))
-    return [distance <= threshold for distance in distances]
+    def reopen(self, sightings: list[Sighting]) -> list[Assignment]:
+        """Let settled sightings wait again; those in the graph are taken back."""
+        self.settled = [sighting for sighting in self.settled if sighting not in set(sightings)]
+        self.waiting = sorted(self.waiting + sightings, key=lambda sighting: sighting.stamp_ns)
+        return [Assignment(s, Outcome.WAITING if s.landmark_id is None else Outcome.TAKEN_BACK) for s in sightings]
 
 
-class DeferredIdentities:
-    """Keeps the graph in line with the identities of tracks.
+class TrackedIdentities:
+    """Policies "robust" and "gate": keeps the graph in line with what is said of detections and of their tracks.
 
-    Late sightings pass a gate, the largest squared Mahalanobis distance. A sighting waits at most ``longest_wait_s``; a
-    track that was not seen for so long is over, and keeps its identity.
+    A sighting waits at most ``longest_wait_s``; a track that was not seen for so long is over, and keeps its identity.
     """
 
     def __init__(
-        self, landmarks: LandmarkSightings, journal: DetectionJournal, gate: float, longest_wait_s: float
+        self, landmarks: LandmarkGraph, params: TrackedIdentity, nameless: NamelessLandmarks | None = None
     ) -> None:
-        self._landmarks = landmarks
-        self._smoother = landmarks.smoother
-        self._journal = journal
-        self._gate = gate
-        self._longest_wait_ns = round(longest_wait_s * NS_PER_S)
+        self._landmarks, self._nameless = landmarks, nameless
+        self._gate, self._minimum_probability = params.gate, params.minimum_probability
+        self._longest_wait_ns = round(params.longest_wait_s * NS_PER_S)
         self._tracks: dict[int, Track] = {}
 
-    def _seen(self, number: int, stamp_ns: int) -> Track:
-        track = self._tracks.setdefault(number, Track())
-        track.newest_ns = stamp_ns
-        return track
+    def screen(self, frame: LandmarkDetections) -> list[Outcome | None]:
+        """Refuse second rows of tracks, and rows of no track whose identity is not probable enough or taken."""
+        if self._nameless is not None:
+            self._nameless.refuse_taken_ids(frame)
+        refusals = second_rows_of_tracks(frame, {number: track.identity for number, track in self._tracks.items()})
+        kept = [row for row, why in enumerate(refusals) if why is None]
+        may_wait = (frame.track != NO_TRACK) | (unnamed(frame) & (self._nameless is not None))
+        said = identify(frame.rows(np.array(kept)), self._minimum_probability)
+        for row, why in zip(kept, said.refusals, strict=True):
+            refusals[row] = None if may_wait[row] else why
+        return refusals
 
-    def hear(self, frame: LandmarkDetections, decisions: list[int], time_s: float) -> None:
-        """Bring earlier sightings in line with what a frame's rows decide (`decide`), before its own are made.
+    def assign(self, frame: SeenFrame) -> Iterator[list[Assignment]]:
+        """Earlier sightings of tracks whose identity changes, then the frame's, those without a name last."""
+        seen = frame.detections
+        is_nameless = unnamed(seen) & (self._nameless is not None)
+        rows, tracks = np.flatnonzero(~is_nameless).tolist(), seen.track.tolist()
+        tracked = [row for row in rows if tracks[row] != NO_TRACK]
+        if tracked:
+            yield from self._hear(seen.rows(np.array(tracked)))
+        sightings: dict[int, Sighting] = {}
+        if rows:
+            assigned = self._judge(frame, rows)
+            sightings = {each.sighting.row: each.sighting for each in assigned}
+            yield assigned
+        if self._nameless is not None:
+            taken = {s.landmark_id for s in sightings.values() if s.landmark_id is not None}
+            yield from self._nameless.assign(frame, np.flatnonzero(is_nameless).tolist(), taken)
+        for row in tracked:
+            sighting, track = sightings[frame.rows[row]], self._tracks[tracks[row]]
+            (track.waiting if sighting.outcome is Outcome.WAITING else track.settled).append(sighting)
+        if tracked:  # what may soon be used stays in the window
+            self._landmarks.smoother.hold(
+                {
+                    waiting.line.pose_key: (waiting.stamp_ns + self._longest_wait_ns) / NS_PER_S
+                    for track in self._tracks.values()
+                    if track.identity != NO_LANDMARK
+                    for waiting in track.waiting
+                }
+            )
+
+    def forget(self, now_ns: int, left: Set[int] = frozenset()) -> list[Assignment]:
+        """Forget sightings that have waited too long or leave the window, and tracks that are over."""
+        oldest_ns, given_up = now_ns - self._longest_wait_ns, []
+        for track in self._tracks.values():
+            gone = {s for s in track.waiting if s.stamp_ns < oldest_ns or s.line.pose_key in left}
+            if gone:
+                why = Outcome.NO_IDENTITY if track.identity == NO_LANDMARK else Outcome.FORGOTTEN
+                given_up += [Assignment(s, why) for s in track.waiting if s in gone and s.outcome is Outcome.WAITING]
+                track.waiting = [sighting for sighting in track.waiting if sighting not in gone]
+            if left:
+                track.settled = [sighting for sighting in track.settled if sighting.line.pose_key not in left]
+        self._tracks = {number: track for number, track in self._tracks.items() if track.newest_ns >= oldest_ns}
+        return given_up + ([] if self._nameless is None else self._nameless.forget(left))
+
+    def smoothed(self) -> Solution:
+        """Solution of the whole graph."""
+        return Solution(*self._landmarks.smoother.solve_history(), self._landmarks.ids)
+
+    def rechosen(self) -> list[Assignment]:
+        """Nothing is chosen anew."""
+        return []
+
+    def _hear(self, frame: LandmarkDetections) -> Iterator[list[Assignment]]:
+        """Bring earlier sightings in line with what a frame's rows decide (`decide`), before its own are judged.
 
         Where tracks come to claim one landmark in one earlier frame, that of the more probable row gets it, but what is
-        used already stays. The frame has one row of each track (`once_a_track`); time is that of the newest keyframe.
+        used already stays; where it is taken back, the one that it had displaced is used.
         """
         stamp_ns = int(frame.stamps_ns[0])
-        self.forget(stamp_ns)
-        rows = zip(frame.track.tolist(), decisions, frame.most_probable()[1].tolist(), strict=True)
-        seen = [
-            (self._seen(number, stamp_ns), decision)
-            for number, decision, _ in sorted(rows, key=lambda row: -row[2])
-            if number != NO_TRACK
-        ]
-        decided = [(track, decision) for track, decision in seen if decision != UNDECIDED]
-        displaced = self._change([(track, new) for track, new in decided if new != track.identity], time_s)
-        coming: list[tuple[Sighting, int]] = []
+        yield self.forget(stamp_ns)
+        decisions, decided = decide(frame, self._minimum_probability), []
+        for row in np.argsort(-frame.most_probable()[1], kind="stable").tolist():
+            track = self._tracks.setdefault(int(frame.track[row]), Track())
+            track.newest_ns = stamp_ns
+            if decisions[row] != UNDECIDED:
+                decided.append((track, decisions[row]))
+        changed = [(track, new) for track, new in decided if new != track.identity]
+        leaving = [s for track, _ in changed for s in track.settled]
+        freed = {(s.landmark_id, s.stamp_ns) for s in leaving if s.landmark_id is not None}
+        back, displaced = [], []
+        for track, new in changed:
+            back += track.reopen(track.settled)
+            track.identity = new
+        for track in self._tracks.values() if freed else ():
+            may_return = [s for s in track.settled if s.outcome is Outcome.REPEATED]
+            if again := [s for s in may_return if (track.identity, s.stamp_ns) in freed]:
+                back += track.reopen(again)
+                displaced.append(track)
+        yield back
+        coming: list[Assignment] = []
         taken: dict[int, set[int]] = {}
         for track in [track for track, _ in decided] + displaced:
             if track.waiting and track.identity >= 0:
                 stamps_ns = taken.setdefault(track.identity, self._landmarks.stamps_ns(track.identity))
-                coming += [(sighting, track.identity) for sighting in self._settle(track, stamps_ns)]
-        if coming:
-            self._landmarks.exchange([], coming, time_s)
+                coming += self._settle(track, stamps_ns)
+        yield coming
 
-    def identity_of(self, number: int) -> int:
-        """Identity that a track counts as, `NO_LANDMARK` or `UNDECIDED`."""
-        track = self._tracks.get(number)
-        return UNDECIDED if track is None else track.identity
+    def _settle(self, track: Track, taken_ns: set[int]) -> list[Assignment]:
+        """Judge a track's waiting sightings; frames that show its landmark already are taken.
 
-    def remember(self, number: int, sighting: Sighting) -> None:
-        """Add a sighting of a track's newest frame; hold keyframes whose sightings may soon be used in the window."""
-        track = self._seen(number, sighting.stamp_ns)
-        (track.waiting if sighting.outcome is Outcome.WAITING else track.settled).append(sighting)
-        self._smoother.hold(
-            {
-                waiting.line.pose_key: (waiting.stamp_ns + self._longest_wait_ns) / NS_PER_S
-                for track in self._tracks.values()
-                if track.identity != NO_LANDMARK
-                for waiting in track.waiting
-            }
-        )
-
-    def forget(self, now_ns: int) -> None:
-        """Forget sightings that have waited too long, and tracks that are over."""
-        oldest_ns = now_ns - self._longest_wait_ns
-        for track in self._tracks.values():
-            if track.waiting and track.waiting[0].stamp_ns < oldest_ns:
-                self._give_up(track, lambda sighting: sighting.stamp_ns < oldest_ns)
-        self._tracks = {number: track for number, track in self._tracks.items() if track.newest_ns >= oldest_ns}
-
-    def leave(self, pose_keys: set[int]) -> None:
-        """Forget what was seen from poses that leave a bounded window: it cannot be used or taken back any more."""
-        for track in self._tracks.values():
-            self._give_up(track, lambda sighting: sighting.line.pose_key in pose_keys)
-            track.settled = [sighting for sighting in track.settled if sighting.line.pose_key not in pose_keys]
-
-    def _give_up(self, track: Track, is_gone: Callable[[Sighting], bool]) -> None:
-        """Forget sightings that wait in a track."""
-        outcome = Outcome.NO_IDENTITY if track.identity == NO_LANDMARK else Outcome.FORGOTTEN
-        for sighting in track.waiting:
-            if is_gone(sighting) and sighting.outcome is Outcome.WAITING:
-                self._journal.amend(sighting.row, outcome)
-        track.waiting = [sighting for sighting in track.waiting if not is_gone(sighting)]
-
-    def _change(self, changed: list[tuple[Track, int]], time_s: float) -> list[Track]:
-        """Take back what tracks no longer count as; return other tracks that get what these had displaced."""
-        leaving = [s for track, _ in changed for s in track.settled if s.landmark_id is not None]
-        freed: dict[int, set[int]] = defaultdict(set)
-        for sighting in leaving:
-            if sighting.landmark_id is not None:
-                freed[sighting.landmark_id].add(sighting.stamp_ns)
-                sighting.outcome = Outcome.TAKEN_BACK
-        if leaving:
-            self._landmarks.exchange(leaving, [], time_s)
-        for track, identity in changed:
-            self._reopen(track, track.settled)
-            track.identity = identity
-        found = []
-        for landmark_id, stamps_ns in freed.items():
-            for track in [track for track in self._tracks.values() if track.identity == landmark_id]:
-                displaced = [s for s in track.settled if s.outcome is Outcome.REPEATED and s.stamp_ns in stamps_ns]
-                if displaced:
-                    self._reopen(track, displaced)
-                    found.append(track)
-        return found
-
-    def _reopen(self, track: Track, sightings: list[Sighting]) -> None:
-        """Let settled sightings wait again."""
-        for sighting in sightings:
-            if sighting.outcome is not Outcome.TAKEN_BACK:
-                sighting.outcome = Outcome.WAITING
-            self._journal.amend(sighting.row, sighting.outcome)
-        reopened = set(sightings)
-        track.settled = [sighting for sighting in track.settled if sighting not in reopened]
-        track.waiting = sorted(track.waiting + sightings, key=lambda sighting: sighting.stamp_ns)
-
-    def _settle(self, track: Track, taken_ns: set[int]) -> list[Sighting]:
-        """Judge a track's waiting sightings and return those to be used; frames that show the landmark are taken."""
+        They pass the gate one by one, as those that come at once, from keyframes as estimated now; all pass where the
+        landmark is not in the graph.
+        """
+        smoother, key = self._landmarks.smoother, L(track.identity)
         free = []
         for sighting in track.waiting:
-            if sighting.stamp_ns in taken_ns:
-                sighting.outcome = Outcome.REPEATED
-            else:
+            if sighting.stamp_ns not in taken_ns:
                 taken_ns.add(sighting.stamp_ns)
                 free.append(sighting)
-        inside = inside_gate(self._smoother, self._gate, free, track.identity)
-        for sighting, is_inside in zip(free, inside, strict=True):
-            used = Outcome.MOVED if sighting.outcome is Outcome.TAKEN_BACK else Outcome.USED_LATER
-            sighting.outcome = used if is_inside else Outcome.GATED
+        inside = set(free)
+        if np.isfinite(self._gate) and free and smoother.values.exists(key):
+            joint = smoother.joint_covariance_of_any([key, *{sighting.line.pose_key for sighting in free}])
+            point = smoother.values.atPoint3(key)[None]
+            for sighting in free:
+                view = late_view(sighting, smoother.values, joint)
+                if view.compare([key], point, sighting.line.z[None], sighting.noise[None]).distance[0] > self._gate:
+                    inside.remove(sighting)
+        judged = []
         for sighting in track.waiting:
-            self._journal.amend(sighting.row, sighting.outcome, track.identity)
+            used = Outcome.MOVED if sighting.outcome is Outcome.TAKEN_BACK else Outcome.USED_LATER
+            refused = Outcome.GATED if sighting in set(free) else Outcome.REPEATED
+            judged.append(Assignment(sighting, used if sighting in inside else refused, track.identity))
         track.settled, track.waiting = track.settled + track.waiting, []
-        return [sighting for sighting in free if sighting.outcome is not Outcome.GATED]
+        return judged
 
-
-def of_no_landmark(_: int) -> int:
-    """Identity of every track while none is known."""
-    return UNDECIDED
-
-
-def once_a_track(
-    frame: LandmarkDetections, identity_of: Callable[[int], int], journal: DetectionJournal
-) -> LandmarkDetections:
-    """Frame with one row of each track; the others go to the journal.
-
-    Parameters
-    ----------
-    identity_of
-        Landmark that a track counts as, by its number; negative: none.
-    """
-    best: dict[int, tuple[float, float, int]] = {}
-    for row, track in enumerate(frame.track.tolist()):
-        if track != NO_TRACK:
-            is_landmark = frame.candidate_ids[row] >= 0
-            ids, posterior = frame.candidate_ids[row, is_landmark], frame.id_probability[row, is_landmark]
-            score = float(posterior[ids == identity_of(track)].sum()), float(posterior.max(initial=0.0)), -row
-            best[track] = max(best.get(track, score), score)
-    is_kept = frame.track == NO_TRACK
-    is_kept[[-score[2] for score in best.values()]] = True
-    if is_kept.all():
-        return frame
-    for landmark_id in frame.most_probable()[0][~is_kept].tolist():
-        journal.record(int(frame.stamps_ns[0]), landmark_id, Outcome.TRACK_REPEATED)
-    return frame.rows(is_kept)
+    def _judge(self, frame: SeenFrame, rows: list[int]) -> list[Assignment]:
+        """Use what has an identity, inside the gate if its landmark is in the graph; the rest waits in its track."""
+        values, make = self._landmarks.smoother.values, self._landmarks.factors
+        said, is_tracked = identify(frame.detections, self._minimum_probability), frame.detections.track != NO_TRACK
+        ids: list[int] = said.ids.tolist()
+        named = [row for row in rows if said.refusals[row] is None]
+        known = [row for row in named if ids[row] in self._landmarks]
+        keys = [L(ids[row]) for row in known]
+        view, judged = frame.predict(keys), []
+        if known:
+            points = np.array([values.atPoint3(key) for key in keys])
+            found = view.compare(keys, points, frame.z[known], frame.noise[known])
+            at = np.where(is_tracked[known, None], np.nan, points)
+            for k, sighting in enumerate(frame.sightings(view, known, at)):
+                is_inside = bool(found.distance[k] <= self._gate)
+                outcome, gain = (Outcome.USED, float(found.gain[k])) if is_inside else (Outcome.GATED, 0.0)
+                judged.append(Assignment(sighting, outcome, ids[known[k]], found.innovation[k], found.S[k], gain))
+        for row in named:
+            if row not in known:  # a landmark begins on the known floor where it can stand on it, else on the beam
+                floor = frame.floor_under(view, row)
+                elevation = make.elevation_on(floor, view.world_T_sonar, frame.z[row])
+                start = beam_point(view.world_T_sonar, frame.z[row], elevation)
+                (sighting,) = frame.sightings(view, [row], None if is_tracked[row] else start[None])
+                sighting.floor, sighting.elevation_rad = floor, 0.0 if is_tracked[row] else elevation
+                judged.append(Assignment(sighting, Outcome.NEW, ids[row], start=start))
+        kept = [row for row in rows if said.refusals[row] is not None]
+        for row, sighting in zip(kept, frame.sightings(view, kept), strict=True):
+            is_taken = said.refusals[row] is Outcome.REPEATED  # a more probable row of the frame has the landmark
+            judged.append(Assignment(sighting, Outcome.REPEATED if is_taken else Outcome.WAITING))
+        return judged

@@ -17,6 +17,7 @@ apart by about that, and P does not know it.
 """
 
 import math
+from collections.abc import Iterator, Set
 from itertools import combinations
 from typing import Annotated, Literal, NamedTuple
 
@@ -29,19 +30,21 @@ from pydantic import Field
 from sonar_graph.calibration import Section
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats, LandmarkDetections
+from sonar_graph.slam.keyframes import Keyframes
 from sonar_graph.slam.landmarks.association import gate_threshold
 from sonar_graph.slam.landmarks.joint_compatibility import UNPAIRED, Innovations, believed, pair_jointly
-from sonar_graph.slam.landmarks.sighting import LandmarkSightings, Sighting, place, source
+from sonar_graph.slam.landmarks.landmark_graph import Assignment, LandmarkGraph
+from sonar_graph.slam.landmarks.sighting import SeenFrame, Sighting, place, source
 from sonar_graph.slam.models import PredictedView, wrap_angle
 from sonar_graph.slam.smoother import JointCovariance
-from sonar_graph.states import FIRST_ANONYMOUS_ID, DetectionJournal, Outcome
+from sonar_graph.states import FIRST_ANONYMOUS_ID, Outcome
 from sonar_graph.tagged_sections import tagged
 
 
 class LandmarkMerging:
     """Finds two landmarks of the graph that are one, inside a gate and denser than a rival (logarithm of 1/m²)."""
 
-    def __init__(self, landmarks: LandmarkSightings, gate_probability: float, log_rival: float) -> None:
+    def __init__(self, landmarks: LandmarkGraph, gate_probability: float, log_rival: float) -> None:
         self._landmarks = landmarks
         self._gate = gate_threshold(gate_probability, 3)
         self._log_rival = log_rival
@@ -81,6 +84,8 @@ class LandmarkMerging:
         return None
 
 
+ROUNDING_S = 1e-3
+"""A keyframe as old as the lag may have left the window."""
 ODDS = 10.0
 """How much more likely a pairing must be than that the detection is of a landmark which is not in the map."""
 LARGEST_SIGMA_SHARE = 0.1
@@ -124,17 +129,6 @@ def unnamed(frame: LandmarkDetections) -> NDArray[np.bool_]:
     return np.asarray((frame.candidate_ids < 0).all(axis=1))
 
 
-def refuse_taken_ids(frame: LandmarkDetections) -> None:
-    """Refuse identities that are reserved for landmarks without names, with an `EstimatorError`."""
-    largest = int(frame.candidate_ids.max())
-    if largest >= FIRST_ANONYMOUS_ID:
-        raise EstimatorError(
-            f"isam2: a detection at {frame.stamps_ns[0]} ns has identity {largest}; with identity.unknown.policy ="
-            f' "associate" those from {FIRST_ANONYMOUS_ID} on are of landmarks without names: number the landmarks'
-            ' below that, or give it identity.unknown.policy = "ignore"'
-        )
-
-
 Candidate = list[Sighting]
 """Sightings that may be of one landmark, in the order of time."""
 
@@ -150,29 +144,88 @@ class PairedDetection(NamedTuple):
     """Its covariance, shape (2, 2)."""
 
 
-class AnonymousLandmarks:
+class NamelessLandmarks:
     """Pairs detections without identities, and begins and merges landmarks."""
 
-    def __init__(self, landmarks: LandmarkSightings, journal: DetectionJournal, policy: AssociatedUnknown) -> None:
-        self._landmarks = landmarks
-        self._smoother, self._maker = landmarks.smoother, landmarks.maker
-        self._journal = journal
-        self._policy = policy
-        self.longest_wait_s = min(policy.longest_wait_s, landmarks.smoother.params.lag_s)
-        """Age, against the newest keyframe, of the oldest keyframes on which sightings may wait."""
-        self._merging = LandmarkMerging(landmarks, policy.gate_probability, policy.log_rival)
+    def __init__(self, landmarks: LandmarkGraph, keyframes: Keyframes, params: AssociatedUnknown) -> None:
+        self._landmarks, self._keyframes, self._params = landmarks, keyframes, params
+        self._smoother, self._factors = landmarks.smoother, landmarks.factors
+        self._longest_wait_s = max(min(params.longest_wait_s, self._smoother.params.lag_s - ROUNDING_S), 0.0)
+        self._merging = LandmarkMerging(landmarks, params.gate_probability, params.log_rival)
         self._candidates: list[Candidate] = []
         self._next_id = FIRST_ANONYMOUS_ID
 
-    @property
-    def has_landmarks(self) -> bool:
-        """True when a landmark of the graph is anonymous."""
-        return any(i >= FIRST_ANONYMOUS_ID for i in self._landmarks.ids)
+    def refuse_taken_ids(self, frame: LandmarkDetections) -> None:
+        """Refuse identities that are reserved for landmarks without names, with an `EstimatorError`."""
+        largest = int(frame.candidate_ids.max())
+        if largest >= FIRST_ANONYMOUS_ID:
+            raise EstimatorError(
+                f"isam2: a detection at {frame.stamps_ns[0]} ns has identity {largest}; with identity.unknown.policy ="
+                f' "associate" those from {FIRST_ANONYMOUS_ID} on are of landmarks without names: number the landmarks'
+                ' below that, or give it identity.unknown.policy = "ignore"'
+            )
 
-    def keys(self) -> list[int]:
+    def assign(self, frame: SeenFrame, rows: list[int], taken: set[int]) -> Iterator[list[Assignment]]:
+        """Merge two landmarks that are one; pair the rows that name none; begin landmarks of what has waited.
+
+        ``taken``: landmarks that are named in this frame.
+        """
+        yield self.forget()
+        named = [i for i in self._landmarks.ids if i < FIRST_ANONYMOUS_ID]
+        nameless = self._landmarks.ids[len(named) :]
+        if nameless and len(self._landmarks.ids) > 1:
+            joint = self._smoother.joint_covariance([self._keyframes.newest_key, *self._keys()])
+            if found := self._merging.nearest(self._smoother.values, joint, named, nameless):
+                stays, goes = found
+                yield [Assignment(s, Outcome.MOVED, stays) for s in self._landmarks.sightings(goes)]
+        if not rows:
+            return
+        view = frame.predict(self._keys())
+        paired = self.pair(view, frame.z[rows], frame.noise[rows], taken)
+        assigned, grown = [], []
+        for sighting, (i, candidate, e, S) in zip(frame.sightings(view, rows), paired, strict=True):
+            if i is not None and S is not None:
+                gain = float((np.diag(S) / np.diag(sighting.noise)).max()) - 1.0
+                assigned.append(Assignment(sighting, Outcome.USED, i, e, S, gain))
+                continue
+            if candidate is None:
+                candidate = []
+                self._candidates.append(candidate)
+            candidate.append(sighting)
+            grown.append(candidate)
+            assigned.append(Assignment(sighting, Outcome.WAITING))
+        yield assigned
+        for candidate in grown:
+            if self.is_placed(candidate):
+                self._candidates.remove(candidate)
+                begins, self._next_id = self._next_id, self._next_id + 1
+                *earlier, newest = candidate
+                yield [
+                    *(Assignment(sighting, Outcome.PLACED_LATER, begins) for sighting in earlier),
+                    Assignment(newest, Outcome.NEW, begins),
+                ]
+
+    def is_placed(self, candidate: Candidate) -> bool:
+        """True when a candidate has enough sightings, which place it well enough."""
+        if len(candidate) < self._params.sightings:
+            return False
+        _, cov = place(candidate, self._smoother.values, self._factors)
+        return bool(np.linalg.eigvalsh(cov)[-1] <= (LARGEST_SIGMA_SHARE * candidate[-1].line.z[0]) ** 2)
+
+    def forget(self, left: Set[int] = frozenset()) -> list[Assignment]:
+        """Forget sightings on keyframes that are too old, or leave a bounded window."""
+        oldest = self._keyframes.oldest_key(self._longest_wait_s)
+        waiting = [sighting for candidate in self._candidates for sighting in candidate]
+        gone = {s for s in waiting if s.line.pose_key < oldest or s.line.pose_key in left}
+        if gone:
+            kept = [[sighting for sighting in candidate if sighting not in gone] for candidate in self._candidates]
+            self._candidates = [candidate for candidate in kept if candidate]
+        return [Assignment(sighting, Outcome.FORGOTTEN) for sighting in waiting if sighting in gone]
+
+    def _keys(self) -> list[int]:
         """Keys whose joint covariance pairing needs: all landmarks, and keyframes that saw candidates."""
-        seen_from = [candidate[-1].line.pose_key for candidate in self._candidates]
-        return [*(L(i) for i in sorted(self._landmarks.ids)), *sorted(set(seen_from))]
+        seen_from = {candidate[-1].line.pose_key for candidate in self._candidates}
+        return [*(L(i) for i in self._landmarks.ids), *sorted(seen_from)]
 
     def pair(self, view: PredictedView, z: Floats, noise: Floats, taken: set[int]) -> list[PairedDetection]:
         """Pair each detection of a frame with a landmark, or else with a candidate.
@@ -185,17 +238,17 @@ class AnonymousLandmarks:
             Landmarks that are named in this frame.
         """
         values = self._smoother.values
-        ids = sorted(self._landmarks.ids - taken)
+        ids = [i for i in self._landmarks.ids if i not in taken]
         keys = [L(i) for i in ids]
         points = np.array([values.atPoint3(key) for key in keys])
-        sources = [source(candidate[-1], values, self._maker) for candidate in self._candidates]
+        sources = [source(candidate[-1], values, self._factors) for candidate in self._candidates]
         if not keys and not sources:
             return [PairedDetection(None, None)] * len(z)
         expected, cov = view.expect_jointly(keys, points, sources)
-        of_landmarks = _choose(z, noise, expected[: len(ids)], cov[: 2 * len(ids), : 2 * len(ids)], self._policy)
+        of_landmarks = _choose(z, noise, expected[: len(ids)], cov[: 2 * len(ids), : 2 * len(ids)], self._params)
         left = [i for i, (landmark, *_) in enumerate(of_landmarks) if landmark == UNPAIRED]
         of_candidates = _choose(
-            z[left], noise[left], expected[len(ids) :], cov[2 * len(ids) :, 2 * len(ids) :], self._policy
+            z[left], noise[left], expected[len(ids) :], cov[2 * len(ids) :, 2 * len(ids) :], self._params
         )
         paired = [
             PairedDetection(ids[j], None, e, S) if j != UNPAIRED else PairedDetection(None, None)
@@ -204,58 +257,6 @@ class AnonymousLandmarks:
         for i, (j, *_) in zip(left, of_candidates, strict=True):
             paired[i] = PairedDetection(None, self._candidates[j] if j != UNPAIRED else None)
         return paired
-
-    def use(self, sightings: list[Sighting], paired: list[PairedDetection], time_s: float) -> None:
-        """Add sightings that were paired with landmarks; the others wait until their candidate becomes a landmark."""
-        for sighting, (landmark_id, candidate, _, S) in zip(sightings, paired, strict=True):
-            if landmark_id is not None and S is not None:
-                gain = float((np.diag(S) / np.diag(sighting.noise)).max()) - 1.0
-                self._landmarks.add(sighting, landmark_id, is_first=False, gain=gain)
-                sighting.outcome = Outcome.USED
-                continue
-            if candidate is None:
-                candidate = []
-                self._candidates.append(candidate)
-            candidate.append(sighting)
-            if len(candidate) < self._policy.sightings:
-                continue
-            _, cov = place(candidate, self._smoother.values, self._maker)
-            if not np.linalg.eigvalsh(cov)[-1] <= (LARGEST_SIGMA_SHARE * sighting.line.z[0]) ** 2:
-                continue
-            landmark_id, self._next_id = self._next_id, self._next_id + 1
-            self._candidates.remove(candidate)
-            for earlier in candidate[:-1]:
-                earlier.outcome = Outcome.PLACED_LATER
-                self._journal.amend(earlier.row, earlier.outcome, landmark_id)
-            sighting.outcome = Outcome.NEW  # its row comes with the frame
-            self._landmarks.exchange([], [(each, landmark_id) for each in candidate], time_s)
-
-    def merge(self, covariance: JointCovariance, time_s: float) -> None:
-        """Give the sightings of one landmark to another that is the same, if there are two such.
-
-        The graph is then that of a run that had known. The joint covariance is of all landmarks.
-        """
-        anonymous = [i for i in self._landmarks.ids if i >= FIRST_ANONYMOUS_ID]
-        named = [i for i in self._landmarks.ids if i < FIRST_ANONYMOUS_ID]
-        found = self._merging.nearest(self._smoother.values, covariance, sorted(named), anonymous)
-        if found is None:
-            return
-        stays, goes = found
-        moving = self._landmarks.sightings(goes)
-        for sighting in moving:
-            sighting.outcome = Outcome.MOVED
-            self._journal.amend(sighting.row, sighting.outcome, stays)
-        self._landmarks.exchange(moving, [(sighting, stays) for sighting in moving], time_s)
-
-    def forget(self, oldest_pose_key: int) -> None:
-        """Forget sightings on keyframes older than one."""
-        for candidate in self._candidates:
-            for sighting in candidate:
-                if sighting.line.pose_key < oldest_pose_key:
-                    sighting.outcome = Outcome.FORGOTTEN
-                    self._journal.amend(sighting.row, sighting.outcome)
-            candidate[:] = [sighting for sighting in candidate if sighting.outcome is Outcome.WAITING]
-        self._candidates = [candidate for candidate in self._candidates if candidate]
 
 
 def _choose(
