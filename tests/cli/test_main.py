@@ -1,5 +1,6 @@
 """What ``--help`` says of every command."""
 
+import os
 import re
 import subprocess
 import sys
@@ -30,10 +31,17 @@ def test_no_argument_shows_the_commands(run, capsys):
         assert path[0] in shown
 
 
-def test_help_does_not_wait_for_heavy_imports(run):
-    heavy = "{'gtsam', 'matplotlib', 'numba', 'numpy', 'scipy'}"
-    code = f"import sys, sonar_graph.cli.main; print(sorted({heavy} & set(sys.modules)))"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
+def test_help_waits_for_no_heavy_import_conversion_for_no_compiler_and_report_compiles_nothing(run, basin, tmp_path):
+    run("compare", basin, "-o", tmp_path, "--estimators", "dead-reckoning")
+    heavy, cache = {"gtsam", "matplotlib", "numba", "numpy", "scipy"}, tmp_path / "cache"
+    park, report = ["convert", "victoria-park", "-o", str(tmp_path / "park.mcap")], ["report", str(tmp_path)]
+    for arguments, unused in ((["--help"], heavy), (park, {"numba"}), (report, set())):
+        at_exit = f"lambda: print(sorted({unused} & set(sys.modules)), file=sys.stderr)"
+        code = f"import atexit, sys, sonar_graph.cli; atexit.register({at_exit}); sonar_graph.cli.main({arguments})"
+        env = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=env)
+        assert done.stderr.splitlines()[-1] == "[]"
+    assert not list(cache.rglob("*.nbi"))
 
 
 def test_version_is_that_of_the_package_which_can_be_run_as_a_module(run, capsys):
