@@ -520,7 +520,8 @@ class FilterShell(ABC):
         if math.isfinite(up[0]):
             self.correct_up(up, sigma)
         self._opened_ns, self._opened_velocity = event.end_ns, (velocity_j, variance_j)
-        self._opened_R = self.attitude()
+        if self._earth is not None:
+            self._opened_R = self.attitude()
 
     def _see(self, landmark_id: int, motion: Motion, z: Floats, R_z: Floats) -> Told:
         """Update by a detection of a landmark, or append the landmark at first sight."""
