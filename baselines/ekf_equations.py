@@ -170,10 +170,7 @@ def observe(
             along_X = Vec3(U[b, 0] - U[b, at], U[b, 1] - U[b, at + 1], U[b, 2] - U[b, at + 2])
             S[a, b] += H_v[a].a @ along_X + H_v[a].b @ Vec3(U[b, 3], U[b, 4], U[b, 5]) + H_b[a] @ (mat6(C) @ H_b[b])
     S[1, 0] = S[0, 1]
-    squared = (S[1, 1] * e[0] ** 2 - 2.0 * S[0, 1] * e[0] * e[1] + S[0, 0] * e[1] ** 2) / (
-        S[0, 0] * S[1, 1] - S[0, 1] ** 2
-    )
-    is_used = squared <= gate
+    is_used = is_inside(e, S, gate)
     if is_used:
         correct(x, P, U, S, e)
     return is_used, e, S

@@ -202,9 +202,11 @@ def polar_covariance(R_z: Floats, aperture_rad: float) -> Floats:
     return V
 
 
+@compiled
 def is_inside(e: Floats, S: Floats, gate: float) -> bool:
-    """True where ``e^T S^-1 e`` is within a gate."""
-    return bool(e @ np.linalg.solve(S, e) <= gate)
+    """True where ``e^T S^-1 e`` of range and azimuth is within a gate."""
+    squared = S[1, 1] * e[0] ** 2 - 2.0 * S[0, 1] * e[0] * e[1] + S[0, 0] * e[1] ** 2
+    return bool(squared / (S[0, 0] * S[1, 1] - S[0, 1] ** 2) <= gate)
 
 
 def far_view(
