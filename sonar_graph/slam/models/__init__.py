@@ -4,12 +4,12 @@
 from sonar_graph.slam.models.factors import GaussianKernel, Kernel, KernelParams, Robust, RobustKernel
 from sonar_graph.slam.models.prediction import PredictedView, Source
 from sonar_graph.slam.models.sonar_model import (
-    FLOOR_GATE, elevation_on_floor, floor_elevation, locate, locate_jacobians, project, range_azimuth_jacobians,
+    FLOOR_GATE, elevation_on_floor, locate, locate_jacobians, project, range_azimuth_jacobians,
     sonar_point, sonar_point_jacobian, wrap_angle,
 )
 
 __all__ = [
     "FLOOR_GATE", "GaussianKernel", "Kernel", "KernelParams", "PredictedView", "Robust", "RobustKernel", "Source",
-    "elevation_on_floor", "floor_elevation", "locate", "locate_jacobians", "project", "range_azimuth_jacobians",
+    "elevation_on_floor", "locate", "locate_jacobians", "project", "range_azimuth_jacobians",
     "sonar_point", "sonar_point_jacobian", "wrap_angle",
 ]

@@ -93,14 +93,12 @@ def project_all(points: Floats, world_T_sonar: Floats) -> tuple[Floats, Floats, 
     return view, by_sonar, by_point
 
 
-@compiled
 def sonar_point(range_m: float, azimuth_rad: float, elevation_rad: float) -> Floats:
     """The point in the sonar frame with these spherical coordinates, shape (3,), m."""
     level = range_m * math.cos(elevation_rad)
     return np.array([level * math.cos(azimuth_rad), level * math.sin(azimuth_rad), range_m * math.sin(elevation_rad)])
 
 
-@compiled
 def sonar_point_jacobian(range_m: float, azimuth_rad: float, elevation_rad: float) -> Floats:
     """Derivative of `sonar_point` by (range, azimuth, elevation), shape (3, 3)."""
     ca, sa, ce, se = math.cos(azimuth_rad), math.sin(azimuth_rad), math.cos(elevation_rad), math.sin(elevation_rad)
@@ -155,33 +153,16 @@ def locate_jacobians(
     return point, by_pose, R_sonar @ sonar_point_jacobian(range_m, azimuth_rad, elevation_rad)
 
 
-@compiled
-def floor_elevation(
-    down_row: Floats, height_m: float, range_m: float, azimuth_rad: float, aperture_rad: float
-) -> float:
-    """Elevation at which a point of given range and azimuth lies on a horizontal plane; NaN outside the aperture.
-
-    With the last row (a, b, c) of world_R_sonar and the plane at ``height_m`` above the sonar::
-
-        (a cos(azimuth) + b sin(azimuth)) cos(e) + c sin(e) = height / range
-
-    which is ``A cos(e - e0) = height / range``: of its two solutions the one nearer to the centre beam.
-    """
-    level = down_row[0] * math.cos(azimuth_rad) + down_row[1] * math.sin(azimuth_rad)
-    amplitude = math.hypot(level, down_row[2])
-    ratio = height_m / (range_m * amplitude) if range_m * amplitude > 0.0 else math.inf
-    if abs(ratio) > 1.0:
-        return math.nan
-    middle, half = math.atan2(down_row[2], level), math.acos(ratio)
-    first, second = wrap_angle(middle + half), wrap_angle(middle - half)
-    nearest = first if abs(first) < abs(second) else second
-    return nearest if abs(nearest) <= 0.5 * aperture_rad else math.nan
-
-
 def elevation_on_floor(
     world_T_sonar: gtsam.Pose3, range_m: float, azimuth_rad: float, floor_z_m: float, aperture_rad: float
 ) -> float | None:
     """Elevation (rad) at which a detected point lies on the floor.
+
+    With the last row (a, b, c) of world_R_sonar and the floor at a height above the sonar::
+
+        (a cos(azimuth) + b sin(azimuth)) cos(e) + c sin(e) = height / range
+
+    which is ``A cos(e - e0) = height / range``: of its two solutions the one nearer to the centre beam.
 
     Parameters
     ----------
@@ -194,7 +175,11 @@ def elevation_on_floor(
     -------
     None when the floor is not within the aperture at that range and azimuth.
     """
-    row = np.ascontiguousarray(world_T_sonar.rotation().matrix()[2])
-    height_m = floor_z_m - float(world_T_sonar.translation()[2])
-    elevation = floor_elevation(row, height_m, range_m, azimuth_rad, aperture_rad)
-    return None if math.isnan(elevation) else elevation
+    a, b, c = world_T_sonar.rotation().matrix()[2].tolist()
+    level = a * math.cos(azimuth_rad) + b * math.sin(azimuth_rad)
+    reach_m, height_m = range_m * math.hypot(level, c), floor_z_m - world_T_sonar.z()
+    if reach_m <= 0.0 or abs(height_m) > reach_m:
+        return None
+    middle, half = math.atan2(c, level), math.acos(height_m / reach_m)
+    nearest = min(wrap_angle(middle + half), wrap_angle(middle - half), key=abs)
+    return nearest if abs(nearest) <= 0.5 * aperture_rad else None
