@@ -46,13 +46,11 @@ from sonar_graph.numerics.matrices import (
 )
 from sonar_graph.slam.models import FLOOR_GATE, sonar_point, sonar_point_jacobian, wrap_angle
 
-POSE = 6
-"""Length of x_v."""
-LANDMARK = 3
-"""Length of p_i."""
+POSE, LANDMARK = 6, 3
+"""Lengths of x_v and of p_i."""
 
 
-# ------------------------------------------------------------------------------------------------- prediction
+# -------------------------------------------------------------------------------- prediction
 
 
 @compiled
@@ -75,34 +73,28 @@ def predict(x: Floats, P: Floats, dR_: Floats, dp_: Floats, C: Floats) -> None:
             P[r, c] = P[c, r]
 
 
-# ------------------------------------------------------------------------------------------------- correction
+# -------------------------------------------------------------------------------- the pose after a motion
 
 
 @compiled
-def correct(x: Floats, P: Floats, U: Floats, S: Floats, e: Floats) -> None:
-    """Update by m numbers: ``x <- x + K e``, ``P <- P - K S K^T``, from ``U = H P`` (m, n); roll and yaw wrapped."""
-    Ke = correction(P, U, S, e)
-    for i in range(len(x)):
-        x[i] += Ke[i]
-    x[3], x[5] = wrap_angle(x[3]), wrap_angle(x[5])
+def body_after(x: Floats, dR_: Floats, dp_: Floats) -> tuple[Floats, Floats, Floats]:
+    """R' (3, 3), X' (3,) and T (6, 6) of the pose after a motion."""
+    dR, dp, angles = mat(dR_), vec(dp_), vec(x[3:])
+    R, W = rotation_from_euler(angles), body_rates_from_euler(angles)
+    R_after, X_after, T = np.empty((3, 3)), np.empty(3), np.zeros((6, 6))
+    store(R @ dR, R_after, 0, 0)
+    X_after[0], X_after[1], X_after[2] = vec(x) + R @ dp
+    store(dR.T @ W, T, 0, 3)
+    store(dR.T @ R.T, T, 3, 0)
+    store(-1.0 * (dR.T @ skew(dp) @ W), T, 3, 3)
+    return R_after, X_after, T
 
 
-@compiled
-def correct_number(x: Floats, P: Floats, k: int, value: float, variance: float) -> None:
-    """Update by a direct measurement of Z, of an angle, or of a coordinate of a landmark."""
-    U, S, e = np.empty((1, len(x))), np.empty((1, 1)), np.empty(1)
-    for i in range(len(x)):
-        U[0, i] = P[k, i]
-    S[0, 0] = P[k, k] + variance
-    e[0] = wrap_angle(value - x[k]) if 3 <= k < POSE else value - x[k]
-    correct(x, P, U, S, e)
-
-
-def correct_up(x: Floats, P: Floats, up: Floats, sigma: float) -> None:
-    """Update roll and pitch by the direction of the world's up in the body, with the sigma of its tilt (rad)."""
-    level = math.hypot(up[1], up[2])
-    correct_number(x, P, 3, math.atan2(up[1], up[2]), (sigma / level) ** 2)
-    correct_number(x, P, 4, math.atan2(-up[0], level), sigma**2)
+def pose_after(x: Floats, P: Floats, motion: Motion) -> tuple[Floats, Floats, Floats]:
+    """Pose of the body a motion after the state: R' (3, 3), X' (3,), and the covariance ``T P_vv T^T + C`` of delta."""
+    R, X, T = body_after(x, motion.dR, motion.dp)
+    cov = T @ P[:POSE, :POSE] @ T.T + motion.C
+    return R, X, 0.5 * (cov + cov.T)
 
 
 @inlined
@@ -119,26 +111,7 @@ def add_row(h: Vec3, P: Floats, at: int, U: Floats, r: int) -> None:
         U[r, i] += h.x * P[at, i] + h.y * P[at + 1, i] + h.z * P[at + 2, i]
 
 
-@compiled
-def correct_depth(
-    x: Floats, P: Floats, dR_: Floats, dp_: Floats, C: Floats, port: Floats, z_m: float, variance: float
-) -> None:
-    """Update by the height of the pressure port q, ``(X' + R' q)_z``: along the body's up, ``n = R'^T e_z``."""
-    dR, dp, angles = mat(dR_), vec(dp_), vec(x[3:])
-    R, W, q = rotation_from_euler(angles), body_rates_from_euler(angles), vec(port)
-    up = (R @ dR).z
-    H_b = Vec6(cross(q, up), up)
-    H_v = by_state(H_b, R, W, dR, dp)
-    U, S, e = np.zeros((1, len(x))), np.empty((1, 1)), np.empty(1)
-    add_row(H_v.a, P, 0, U, 0)
-    add_row(H_v.b, P, 3, U, 0)
-    share = H_v.a @ Vec3(U[0, 0], U[0, 1], U[0, 2]) + H_v.b @ Vec3(U[0, 3], U[0, 4], U[0, 5])
-    S[0, 0] = share + H_b @ (mat6(C) @ H_b) + variance
-    e[0] = z_m - (x[2] + R.z @ dp + up @ q)
-    correct(x, P, U, S, e)
-
-
-# ------------------------------------------------------------------------------------------------- observation
+# -------------------------------------------------------------------------------- observation and innovation
 
 
 @compiled
@@ -176,30 +149,6 @@ def observe(
     return is_used, e, S
 
 
-# ------------------------------------------------------------------------------------------------- pose, augmentation
-
-
-@compiled
-def body_after(x: Floats, dR_: Floats, dp_: Floats) -> tuple[Floats, Floats, Floats]:
-    """R' (3, 3), X' (3,) and T (6, 6) of the pose after a motion."""
-    dR, dp, angles = mat(dR_), vec(dp_), vec(x[3:])
-    R, W = rotation_from_euler(angles), body_rates_from_euler(angles)
-    R_after, X_after, T = np.empty((3, 3)), np.empty(3), np.zeros((6, 6))
-    store(R @ dR, R_after, 0, 0)
-    X_after[0], X_after[1], X_after[2] = vec(x) + R @ dp
-    store(dR.T @ W, T, 0, 3)
-    store(dR.T @ R.T, T, 3, 0)
-    store(-1.0 * (dR.T @ skew(dp) @ W), T, 3, 3)
-    return R_after, X_after, T
-
-
-def pose_after(x: Floats, P: Floats, motion: Motion) -> tuple[Floats, Floats, Floats]:
-    """Pose of the body a motion after the state: R' (3, 3), X' (3,), and the covariance ``T P_vv T^T + C`` of delta."""
-    R, X, T = body_after(x, motion.dR, motion.dp)
-    cov = T @ P[:POSE, :POSE] @ T.T + motion.C
-    return R, X, 0.5 * (cov + cov.T)
-
-
 def location(
     x: Floats, motion: Motion, sonar: SonarModel, z: Floats, elevation_rad: float
 ) -> tuple[Floats, Floats, Floats, Floats]:
@@ -213,21 +162,6 @@ def location(
     minus_q_x = np.array([[0.0, q[2], -q[1]], [-q[2], 0.0, q[0]], [q[1], -q[0], 0.0]])
     G_b = R @ np.hstack([minus_q_x, np.eye(3)])
     return X + R @ q, G_b @ T, G_b, R @ sonar.body_R_sonar @ sonar_point_jacobian(z[0], z[1], elevation_rad)
-
-
-def augment(x: Floats, P: Floats, motion: Motion, sonar: SonarModel, z: Floats, R_z: Floats) -> tuple[Floats, Floats]:
-    """State and covariance with a new landmark where it was seen, on a floor of known height within the floor's gate.
-
-    ``P_pv = G_v P_v.``,  ``P_pp = G_v P_vv G_v^T + G_b C G_b^T + G_z diag(R_z, elevation_sigma^2) G_z^T``.
-    """
-    R, X, _ = body_after(x, motion.dR, motion.dp)
-    p, G_v, G_b, G_z = location(x, motion, sonar, z, sonar.elevation_of_new(R, X, z))
-    P_pv = G_v @ P[:POSE]
-    P_pp = P_pv[:, :POSE] @ G_v.T + G_b @ motion.C @ G_b.T + G_z @ polar_covariance(R_z, sonar.aperture_rad) @ G_z.T
-    x, P = np.concatenate([x, p]), np.block([[P, P_pv.T], [P_pv, 0.5 * (P_pp + P_pp.T)]])
-    if (sonar.floor_z_m - x[-1]) ** 2 <= FLOOR_GATE * (P[-1, -1] + sonar.floor_variance_m2):
-        correct_number(x, P, len(x) - 1, sonar.floor_z_m, sonar.floor_variance_m2)
-    return x, P
 
 
 def observe_far(
@@ -246,3 +180,70 @@ def observe_far(
     if is_used:
         correct(x, P, U, cov, missed)
     return is_used, e, S
+
+
+# -------------------------------------------------------------------------------- update
+
+
+@compiled
+def correct(x: Floats, P: Floats, U: Floats, S: Floats, e: Floats) -> None:
+    """Update by m numbers: ``x <- x + K e``, ``P <- P - K S K^T``, from ``U = H P`` (m, n); roll and yaw wrapped."""
+    Ke = correction(P, U, S, e)
+    for i in range(len(x)):
+        x[i] += Ke[i]
+    x[3], x[5] = wrap_angle(x[3]), wrap_angle(x[5])
+
+
+@compiled
+def correct_number(x: Floats, P: Floats, k: int, value: float, variance: float) -> None:
+    """Update by a direct measurement of Z, of an angle, or of a coordinate of a landmark."""
+    U, S, e = np.empty((1, len(x))), np.empty((1, 1)), np.empty(1)
+    for i in range(len(x)):
+        U[0, i] = P[k, i]
+    S[0, 0] = P[k, k] + variance
+    e[0] = wrap_angle(value - x[k]) if 3 <= k < POSE else value - x[k]
+    correct(x, P, U, S, e)
+
+
+def correct_up(x: Floats, P: Floats, up: Floats, sigma: float) -> None:
+    """Update roll and pitch by the direction of the world's up in the body, with the sigma of its tilt (rad)."""
+    level = math.hypot(up[1], up[2])
+    correct_number(x, P, 3, math.atan2(up[1], up[2]), (sigma / level) ** 2)
+    correct_number(x, P, 4, math.atan2(-up[0], level), sigma**2)
+
+
+@compiled
+def correct_depth(
+    x: Floats, P: Floats, dR_: Floats, dp_: Floats, C: Floats, port: Floats, z_m: float, variance: float
+) -> None:
+    """Update by the height of the pressure port q, ``(X' + R' q)_z``: along the body's up, ``n = R'^T e_z``."""
+    dR, dp, angles = mat(dR_), vec(dp_), vec(x[3:])
+    R, W, q = rotation_from_euler(angles), body_rates_from_euler(angles), vec(port)
+    up = (R @ dR).z
+    H_b = Vec6(cross(q, up), up)
+    H_v = by_state(H_b, R, W, dR, dp)
+    U, S, e = np.zeros((1, len(x))), np.empty((1, 1)), np.empty(1)
+    add_row(H_v.a, P, 0, U, 0)
+    add_row(H_v.b, P, 3, U, 0)
+    share = H_v.a @ Vec3(U[0, 0], U[0, 1], U[0, 2]) + H_v.b @ Vec3(U[0, 3], U[0, 4], U[0, 5])
+    S[0, 0] = share + H_b @ (mat6(C) @ H_b) + variance
+    e[0] = z_m - (x[2] + R.z @ dp + up @ q)
+    correct(x, P, U, S, e)
+
+
+# -------------------------------------------------------------------------------- augmentation
+
+
+def augment(x: Floats, P: Floats, motion: Motion, sonar: SonarModel, z: Floats, R_z: Floats) -> tuple[Floats, Floats]:
+    """State and covariance with a new landmark where it was seen, on a floor of known height within the floor's gate.
+
+    ``P_pv = G_v P_v.``,  ``P_pp = G_v P_vv G_v^T + G_b C G_b^T + G_z diag(R_z, elevation_sigma^2) G_z^T``.
+    """
+    R, X, _ = body_after(x, motion.dR, motion.dp)
+    p, G_v, G_b, G_z = location(x, motion, sonar, z, sonar.elevation_of_new(R, X, z))
+    P_pv = G_v @ P[:POSE]
+    P_pp = P_pv[:, :POSE] @ G_v.T + G_b @ motion.C @ G_b.T + G_z @ polar_covariance(R_z, sonar.aperture_rad) @ G_z.T
+    x, P = np.concatenate([x, p]), np.block([[P, P_pv.T], [P_pv, 0.5 * (P_pp + P_pp.T)]])
+    if (sonar.floor_z_m - x[-1]) ** 2 <= FLOOR_GATE * (P[-1, -1] + sonar.floor_variance_m2):
+        correct_number(x, P, len(x) - 1, sonar.floor_z_m, sonar.floor_variance_m2)
+    return x, P
