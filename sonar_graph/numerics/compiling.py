@@ -23,9 +23,9 @@ class _Progress(event.Listener):
         self._depth, self._count, self._told_s = 0, 0, 0.0
 
     def on_start(self, event: Any) -> None:
-        dispatcher, now_s, terminal = event.data["dispatcher"], time.monotonic(), _terminal()
-        if dispatcher.py_func.__module__ not in COMPILED_IN:
+        if not _is_ours(event):
             return
+        dispatcher, now_s, terminal = event.data["dispatcher"], time.monotonic(), _terminal()
         if not self._count:
             self._told_s = now_s
             if not any(Path(dispatcher._cache.cache_path).glob("*.nbi")):
@@ -40,10 +40,16 @@ class _Progress(event.Listener):
             LOG.warning(line)
 
     def on_end(self, event: Any) -> None:
-        if event.data["dispatcher"].py_func.__module__ in COMPILED_IN:
+        if _is_ours(event):
             self._depth -= 1
             if not self._depth and (terminal := _terminal()):
                 print("\r\x1b[2K", end="", file=terminal, flush=True)
+
+
+def _is_ours(event: Any) -> bool:
+    """True for a function of ours with a name, which rules of operators have not."""
+    function = event.data["dispatcher"].py_func
+    return function.__module__ in COMPILED_IN and function.__name__ != "<lambda>"
 
 
 def _terminal() -> Any:
