@@ -65,6 +65,7 @@ def test_biases_in_a_row_are_least_squares(lag_s):
             b.append(0.0)
         A.append(np.eye(8)[k] / reading)
         b.append(np.sin(k) / reading)
+    assert smoother.in_window([B(0), B(7)]) == ([B(0), B(7)] if lag_s == FOREVER_S else [B(7)])
     cov = np.linalg.inv(np.transpose(A) @ A)
     assert smoother.values.atPoint3(B(7)) == pytest.approx([(cov @ np.transpose(A) @ b)[7]] * 3, abs=1e-9)
     assert np.diag(smoother.marginals.marginalCovariance(B(7))) == pytest.approx([cov[7, 7]] * 3, abs=1e-9)
