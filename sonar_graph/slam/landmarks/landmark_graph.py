@@ -164,11 +164,13 @@ class LandmarkGraph:
         What was seen from poses that left a bounded window is part of the graph for good: its landmark stays, whatever
         becomes of its other sightings, and none of those becomes its first.
         """
+        if not (changed.withheld or changed.left):
+            return  # as after most updates; what follows looks at every sighting of the run
         for sighting in [s for sightings in self._of.values() for s in sightings if s.handle in changed.withheld]:
             self._take(sighting)
             sighting.outcome = Outcome.WITHHELD
             self.journal.amend(sighting.row, Outcome.WITHHELD)
-        for landmark, sightings in self._of.items() if changed.left else ():
+        for landmark, sightings in self._of.items():
             for sighting in [s for s in sightings if s.line.pose_key in changed.left]:
                 self._rooted.setdefault(landmark, sighting)
                 del sightings[sighting]
