@@ -196,7 +196,6 @@ def look(filter_, X, position_sigma_m, may_be_far, wrong_m=0.0):
     return is_used, at, covariance[3:, 3:], e, S
 
 
-@pytest.mark.slow
 @both
 def test_one_look_finds_a_vehicle_that_is_far_from_where_it_was_expected(filter_):
     """And linearised where it was expected it is sure of a wrong place."""
