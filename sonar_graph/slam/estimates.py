@@ -1,4 +1,4 @@
-"""Answers of the estimator: poses at the instants that were asked for, and joint covariances.
+"""Answers of the estimator: poses at the instants that were asked for, and the solution of the whole graph.
 
 An instant is tied to the newest keyframe of its time by odometry. While that keyframe may still change, the tie is
 kept. Once it leaves a bounded window, only the pose is kept: 232 bytes an instant.
@@ -6,18 +6,16 @@ kept. Once it leaves a bounded window, only the pose is kept: 232 bytes an insta
 
 from array import array
 from bisect import bisect_left
-from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from typing import Literal, NamedTuple, get_args
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import L, X
+from gtsam.symbol_shorthand import X
 
-from sonar_graph.errors import EstimatorError
 from sonar_graph.navigation import PreintegratedMotion
-from sonar_graph.slam.smoother import JointCovariance, Smoother
+from sonar_graph.slam.smoother import JointCovariance
 from sonar_graph.states import Estimate, Trajectory
 
 TRIANGLE = np.tril_indices(6)
@@ -120,11 +118,6 @@ def _estimates(
     return estimates
 
 
-Over = Literal["window", "history"]
-MOST_LISTED = 12
-"""Most landmarks that a message lists."""
-
-
 class Solution(NamedTuple):
     """Solution of the whole graph."""
 
@@ -132,59 +125,3 @@ class Solution(NamedTuple):
     marginals: gtsam.Marginals | gtsam.ISAM2
     ids: list[int]
     """Landmarks in it, ascending."""
-
-
-def joint_covariance(
-    smoother: Smoother,
-    history: Callable[[], Solution],
-    stamps_ns: Sequence[int],
-    over: Over,
-    keyframes: Iterable[int],
-    at_ns: Iterable[int],
-    landmarks: Iterable[int],
-) -> JointCovariance:
-    """See `sonar_graph.slam.isam2.Isam2.joint_covariance`.
-
-    ``history`` solves the whole graph; ``stamps_ns`` are those of all keyframes, ``at_ns`` those asked for beside
-    ``keyframes``.
-    """
-    if over not in get_args(Over):
-        raise EstimatorError(f'isam2: over is {over!r}; expected "window" or "history"')
-    asked: list[list[int]] = []
-    for field, given in (("keyframes", keyframes), ("stamps_ns", at_ns), ("landmarks", landmarks)):
-        found = np.asarray(list(given) if isinstance(given, Iterable) else given)
-        if found.ndim != 1 or (found.size and found.dtype.kind not in "iu"):
-            raise EstimatorError(f"isam2: {field}: expected a list of integers, such as [1, 2], not {given!r}")
-        asked.append(found.tolist())
-    poses = [*asked[0], *(_number_at(stamp_ns, stamps_ns) for stamp_ns in asked[1])]
-    for number in poses:
-        if not 0 <= number < len(stamps_ns):
-            existing = f"it has 0 to {len(stamps_ns) - 1}" if stamps_ns else "none was set yet"
-            raise EstimatorError(f"isam2: there is no keyframe {number}; {existing}")
-    ids = smoother.landmark_ids if over == "window" else history().ids
-    if unknown := [i for i in asked[2] if i not in set(ids)]:
-        listed = ", ".join(map(str, ids[:MOST_LISTED])) + (", ..." if len(ids) > MOST_LISTED else "")
-        raise EstimatorError(f"isam2: landmark {unknown[0]} is not in the graph; it holds {listed or 'none yet'}")
-    keys = list(dict.fromkeys([*map(X, poses), *map(L, asked[2])]))
-    if not keys:
-        raise EstimatorError("isam2: the covariance of nothing was asked for; give keyframes, stamps or landmarks")
-    held = set(smoother.in_window(keys))
-    left = [number for number in dict.fromkeys(poses) if X(number) not in held]
-    if left and (over == "window" or smoother.is_bounded):
-        first = next((k for k in range(len(stamps_ns)) if smoother.in_window([X(k)])), len(stamps_ns) - 1)
-        instead = "none is known any more" if smoother.is_bounded else 'ask over="history" for older ones'
-        raise EstimatorError(
-            f"isam2: keyframe {left[0]} has left the window, which holds {first} to {len(stamps_ns) - 1}; {instead}"
-        )
-    if over == "window":
-        return JointCovariance.of(smoother.marginals, sorted(keys))
-    return JointCovariance.of(history().marginals, sorted(keys))
-
-
-def _number_at(stamp_ns: int, stamps_ns: Sequence[int]) -> int:
-    place = bisect_left(stamps_ns, stamp_ns)
-    if place < len(stamps_ns) and stamps_ns[place] == stamp_ns:
-        return place
-    beside = " and ".join(str(stamp) for stamp in stamps_ns[max(place - 1, 0) : place + 1])
-    nearest = f"the nearest are at {beside} ns" if beside else "there is none yet"
-    raise EstimatorError(f"isam2: no keyframe at {stamp_ns} ns; {nearest}")

@@ -9,19 +9,20 @@ One call of `Isam2.process`::
 """
 
 import math
+from bisect import bisect_left
 from collections.abc import Iterable
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Literal, Self, get_args
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import L
+from gtsam.symbol_shorthand import L, X
 from pydantic import model_validator
 
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.errors import CalibrationError, EstimatorError
 from sonar_graph.measurements import NS_PER_S, Floats, Ints, Measurements
 from sonar_graph.motion import MotionSource
-from sonar_graph.slam.estimates import AnchoredPose, Over, PoseHistory, joint_covariance
+from sonar_graph.slam.estimates import AnchoredPose, PoseHistory
 from sonar_graph.slam.frontend import Frontend
 from sonar_graph.slam.keyframes import KeyframeParams, Keyframes
 from sonar_graph.slam.landmarks import IdentityParams, MixtureIdentity, RobustIdentity
@@ -29,6 +30,10 @@ from sonar_graph.slam.models import KernelParams, RobustKernel
 from sonar_graph.slam.smoother import HistoryParams, JointCovariance, Smoother, SmootherParams, WholeHistory
 from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, RefusedRow, Trajectory
 from sonar_graph.tagged_sections import misfits
+
+Over = Literal["window", "history"]
+MOST_LISTED = 12
+"""Most landmarks that a message lists."""
 
 
 class Isam2Params(Section):
@@ -221,10 +226,45 @@ class Isam2:
         EstimatorError
             When something is not known, or has left the window; it says what there is.
         """
-        history = self._sightings.smoothed
-        return joint_covariance(
-            self._smoother, history, self._keyframes.stamps_ns, over, keyframes, stamps_ns, landmarks
-        )
+        if over not in get_args(Over):
+            raise EstimatorError(f'isam2: over is {over!r}; expected "window" or "history"')
+        asked: list[list[int]] = []
+        for field, given in (("keyframes", keyframes), ("stamps_ns", stamps_ns), ("landmarks", landmarks)):
+            found = np.asarray(list(given) if isinstance(given, Iterable) else given)
+            if found.ndim != 1 or (found.size and found.dtype.kind not in "iu"):
+                raise EstimatorError(f"isam2: {field}: expected a list of integers, such as [1, 2], not {given!r}")
+            asked.append(found.tolist())
+        smoother, existing_ns, poses = self._smoother, self._keyframes.stamps_ns, asked[0]
+        newest = len(existing_ns) - 1
+        for stamp_ns in asked[1]:
+            place = bisect_left(existing_ns, stamp_ns)
+            if existing_ns[place : place + 1] != [stamp_ns]:
+                beside = " and ".join(str(stamp) for stamp in existing_ns[max(place - 1, 0) : place + 1])
+                nearest = f"the nearest are at {beside} ns" if beside else "there is none yet"
+                raise EstimatorError(f"isam2: no keyframe at {stamp_ns} ns; {nearest}")
+            poses.append(place)
+        for number in poses:
+            if not 0 <= number <= newest:
+                known = f"it has 0 to {newest}" if existing_ns else "none was set yet"
+                raise EstimatorError(f"isam2: there is no keyframe {number}; {known}")
+        ids = smoother.landmark_ids if over == "window" else self._sightings.smoothed().ids
+        if unknown := [i for i in asked[2] if i not in set(ids)]:
+            listed = ", ".join(map(str, ids[:MOST_LISTED])) + (", ..." if len(ids) > MOST_LISTED else "")
+            raise EstimatorError(f"isam2: landmark {unknown[0]} is not in the graph; it holds {listed or 'none yet'}")
+        keys = list(dict.fromkeys([*map(X, poses), *map(L, asked[2])]))
+        if not keys:
+            raise EstimatorError("isam2: the covariance of nothing was asked for; give keyframes, stamps or landmarks")
+        held = set(smoother.in_window(keys))
+        left = [number for number in dict.fromkeys(poses) if X(number) not in held]
+        if left and (over == "window" or smoother.is_bounded):
+            first = next((k for k in range(newest) if smoother.in_window([X(k)])), newest)
+            instead = "none is known any more" if smoother.is_bounded else 'ask over="history" for older ones'
+            raise EstimatorError(
+                f"isam2: keyframe {left[0]} has left the window, which holds {first} to {newest}; {instead}"
+            )
+        if over == "window":
+            return JointCovariance.of(smoother.marginals, sorted(keys))
+        return JointCovariance.of(self._sightings.smoothed().marginals, sorted(keys))
 
     def trajectory(self) -> Trajectory:
         """The smoothed pose at every instant at which `process` returned an estimate.

@@ -210,19 +210,8 @@ def landmark_sighting(
     both = {"range and azimuth": correlated_sighting(*keys, body_T_sonar, z, cov, robust)}
     if not elevation_sigma_rad:
         return both
-    return {"elevation": elevation(*keys, body_T_sonar, float(z[1]), elevation_sigma_rad, robust), **both}
-
-
-def elevation(
-    pose_key: int,
-    landmark_key: int,
-    body_T_sonar: gtsam.Pose3,
-    azimuth_rad: float,
-    elevation_sigma_rad: float,
-    robust: Robust,
-) -> gtsam.NoiseModelFactor:
-    """Elevation of a landmark at this azimuth is N(0, sigma²); the azimuth is not said."""
-    return _camera(pose_key, landmark_key, body_T_sonar, azimuth_rad, UNINFORMATIVE_RAD, elevation_sigma_rad, robust)
+    elevation = _camera(*keys, body_T_sonar, float(z[1]), UNINFORMATIVE_RAD, elevation_sigma_rad, robust)
+    return {"elevation": elevation, **both}
 
 
 def _camera(
@@ -234,6 +223,7 @@ def _camera(
     elevation_sigma_rad: float | None,
     robust: Robust,
 ) -> gtsam.NoiseModelFactor:
+    """Azimuth and elevation of a landmark about a direction at elevation 0; without a sigma elevation is not said."""
     sonar_R_camera = gtsam.Rot3.Rz(azimuth_rad).compose(BEAM_R_CAMERA)
     body_T_camera = body_T_sonar.compose(gtsam.Pose3(sonar_R_camera, ORIGIN))
     vertical = UNINFORMATIVE_RAD if elevation_sigma_rad is None else elevation_sigma_rad
