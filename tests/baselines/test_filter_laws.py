@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from baselines.dead_reckoning import DeadReckoning
 from baselines.ekf_slam import EkfSlam
-from baselines.filter import DEPTH, END, EPOCH, FRAME, GRAVITY, in_order
+from baselines.filter import DEPTH, END, EPOCH, FRAME, GRAVITY, corrected, in_order
 from baselines.invariant_ekf import InvariantEkf
 from sonar_graph.calibration import (
     Calibration,
@@ -300,6 +300,35 @@ def test_the_outcome_depends_neither_on_how_the_log_is_cut_nor_on_being_asked(mi
         at = np.searchsorted(live.trajectory().stamps_ns, other.trajectory().stamps_ns)
         assert_array_equal(live.trajectory().positions[at], other.trajectory().positions)
         assert_array_equal(live.trajectory().covariances[at], other.trajectory().covariances)
+
+
+def test_a_bias_and_the_earth_s_rate_are_removed_from_a_motion_as_from_its_rows(mission):
+    """Over a second of turning: to first order in the bias, and in the Earth's rate with that of both ends."""
+    bias, earth, zero = np.array([2e-3, -1e-3, 3e-3]), np.array([1e-3, 2e-3, -1e-3]), np.zeros(3)
+    unbiased = replace(mission.imu, angular_velocity=mission.imu.angular_velocity - bias)
+    motions = []
+    for rows in (mission.imu, unbiased):
+        odometry = Odometry(mission.calibration)
+        odometry.add(rows, mission.dvl)
+        epochs_ns = odometry.epochs(mission.start_ns, mission.start_ns + 20 * NS_PER_S)
+        start_ns, end_ns = epochs_ns[:-8], epochs_ns[8:]
+        motions.append(odometry.motions(start_ns, end_ns, odometry.reached_ns(end_ns), zero))
+    turns = 0.0
+    for start, end, (dR, dp, _, D, impulse), exact in zip(
+        start_ns, end_ns, zip(*motions[0], strict=True), zip(*motions[1], strict=True), strict=True
+    ):
+        if np.isnan(dp[0]):
+            continue
+        R, p, push = corrected(dR, dp, D, impulse, bias, zero)
+        assert_allclose(Rotation.from_matrix(exact[0].T @ R).as_rotvec(), 0.0, atol=2e-5)
+        assert_allclose(p, exact[1], atol=1e-5)
+        assert_allclose(push, exact[4], atol=5e-3)
+        R, _, _ = corrected(dR, dp, D, impulse, zero, earth)
+        duration_s = (end - start) * 1e-9
+        turned = Rotation.from_rotvec(-earth * duration_s).as_matrix() @ dR
+        assert_allclose(Rotation.from_matrix(turned.T @ R).as_rotvec(), 0.0, atol=2e-5)
+        turns = max(turns, Rotation.from_matrix(dR).magnitude())
+    assert turns > 0.1
 
 
 def test_events_come_in_the_order_of_their_stamps_each_with_its_motion_from_the_newest_epoch():
