@@ -57,8 +57,7 @@ class EkfSlam(FilterShell):
         super().__init__(calibration, odometry, params or EkfSlamParams())
         start = calibration.start
         self._x, self._P = np.array([*start.position_m, *start.pose().rotation().rpy()]), np.zeros((POSE, POSE))
-        W = ekf_equations.body_after(self._x, np.eye(3), np.zeros(3))[2][:3, 3:]
-        E = np.linalg.inv(W)
+        E = np.linalg.inv(ekf_equations.body_after(self._x, np.eye(3), np.zeros(3))[2][:3, 3:])
         self._P[:3, :3] = np.diag(np.square(start.position_sigma_m))
         self._P[3:, 3:] = E @ np.diag(np.square(start.rpy_sigma_rad)) @ E.T
 
@@ -87,11 +86,8 @@ class EkfSlam(FilterShell):
 
     def correct_plane(self, plane: PlanarMotion) -> None:
         """Update Z, roll and pitch."""
-        for k, value, sigma in (
-            (2, plane.z_m, plane.z_sigma_m),
-            (3, 0.0, plane.tilt_sigma_rad),
-            (4, 0.0, plane.tilt_sigma_rad),
-        ):
+        tilt = (0.0, plane.tilt_sigma_rad)
+        for k, (value, sigma) in enumerate([(plane.z_m, plane.z_sigma_m), tilt, tilt], start=2):
             ekf_equations.correct_number(self._x, self._P, k, value, sigma**2)
 
     def correct_depth(self, motion: Motion, z_m: float, variance_m2: float) -> None:

@@ -4,7 +4,7 @@ A filter's state sits at an epoch, a stamp of the Doppler log. Events happen in 
 calls in which measurements arrive: an epoch when it is reached, a depth sample, then the detections of a frame. What is
 measured at an instant is related to the newest epoch reached by then, through a motion from rows stamped no later::
 
-    epoch i --- epoch j          predict; then gravity, where an interval of it ends here, and the plane
+    epoch i --- epoch j          predict; then the plane, and gravity where an interval of it ends here
           i -------- t           depth sample, frame, or estimate at the end of the call
 
 Measurements that are related to one epoch over the same gap of the Doppler log share its error. The k-th gets k (k + 1)
@@ -100,14 +100,8 @@ class Event(NamedTuple):
 def in_order(happening: list[tuple[int, int, int]], node_ns: int, opened_ns: int, interval_ns: int) -> list[Event]:
     """Events in their order, each with its motion from the newest epoch; gravity's from the one where it was last used.
 
-    Parameters
-    ----------
-    happening
-        Stamp, kind and row, in any order.
-    node_ns, opened_ns
-        Epoch of the state, and the one at which the interval of gravity began.
-    interval_ns
-        Least length of an interval of gravity; 0: none is used.
+    ``happening``: stamp, kind and row, in any order. ``node_ns``, ``opened_ns``: epoch of the state, and that at which the
+    interval of gravity began. ``interval_ns``: least length of such an interval; 0: none is used.
     """
     events = []
     for stamp_ns, kind, row in sorted(happening):
@@ -265,20 +259,9 @@ KEPT_NS = 10_000_000_000
 
 
 class FilterShell(ABC):
-    """Estimator around the mathematics of a filter, which a subclass adds.
-
-    Parameters
-    ----------
-    calibration
-        Noise, mountings, start, floor.
-    odometry
-        Source of motion; the filter takes its rows in.
-    params
-        Gate and gravity.
-    """
+    """Estimator around the mathematics of a filter, which a subclass adds; `name` stands in messages."""
 
     name: str
-    """Name of the filter in messages."""
 
     def __init__(self, calibration: Calibration, odometry: MotionSource, params: FilterParams) -> None:
         self.calibration, self.odometry = calibration, odometry
