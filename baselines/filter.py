@@ -100,8 +100,8 @@ class Event(NamedTuple):
 def in_order(happening: list[tuple[int, int, int]], node_ns: int, opened_ns: int, interval_ns: int) -> list[Event]:
     """Events in their order, each with its motion from the newest epoch; gravity's from the one where it was last used.
 
-    ``happening``: stamp, kind and row, in any order. ``node_ns``, ``opened_ns``: epoch of the state, and that at which the
-    interval of gravity began. ``interval_ns``: least length of such an interval; 0: none is used.
+    ``happening``: stamp, kind and row, in any order; ``node_ns``, ``opened_ns``: epochs of the state and at which
+    the interval of gravity began; ``interval_ns``: least length of such an interval, 0 for none.
     """
     events = []
     for stamp_ns, kind, row in sorted(happening):
