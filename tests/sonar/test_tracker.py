@@ -220,13 +220,15 @@ def test_a_correction_is_that_of_the_information_form():
     assert after.position_m[0] == pytest.approx(q + gain @ [0.02, -0.01], abs=1e-7)
 
 
-def test_what_leaves_the_image_ends_and_is_not_held_against_it():
+@pytest.mark.parametrize(("inside_m", "ahead"), [(0.15, 1.0), (-0.15, -1.0)], ids=["too near", "too far"])
+def test_what_leaves_the_image_ends_and_is_not_held_against_it(inside_m, ahead):
     tracker = Tracker(TrackingParams(lifetime_s=1e12))
-    before = run(tracker, [[(1.4, 0.0)]] * 10)[-1]
-    tracker.skip(moved_by(0.2))
+    start_m = WINDOW[0, 0 if inside_m > 0 else 1] + inside_m
+    before = run(tracker, [[(start_m, 0.0)]] * 10)[-1]
+    tracker.skip(moved_by(0.2 * ahead))
     out = tracker.step(candidates_at([], []), moved_by(0.0), 20 * FRAME_NS)
     assert out.ended_ids.tolist() == before.ids.tolist() or out.existence[0] > 0.99
-    gone = tracker.step(candidates_at([], []), moved_by(0.3), 21 * FRAME_NS)
+    gone = tracker.step(candidates_at([], []), moved_by(0.3 * ahead), 21 * FRAME_NS)
     assert "left the image" in out.ended_reasons + gone.ended_reasons
 
 
