@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from baselines.dead_reckoning import DeadReckoning
 from baselines.ekf_slam import EkfSlam
-from baselines.filter import DEPTH, END, EPOCH, FRAME, GRAVITY, corrected, in_order
+from baselines.filter import DEPTH, END, EPOCH, FRAME, GRAVITY, Motion, corrected, in_order
 from baselines.invariant_ekf import InvariantEkf
 from sonar_graph.calibration import (
     Calibration,
@@ -33,7 +33,7 @@ from sonar_graph.measurements import NS_PER_S, Depth, Dvl, Imu, LandmarkDetectio
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
-from sonar_graph.states import CausalEstimates, Estimate, Outcome
+from sonar_graph.states import CausalEstimates, Estimate, Outcome, Refusal
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks" / "performance"
 T0_NS = 1_700_000_000 * NS_PER_S
@@ -248,6 +248,18 @@ def test_each_detection_has_its_outcome_and_a_refused_one_changes_nothing(kind):
     assert log.innovations[4] == pytest.approx([0.5, 0.0], abs=1e-6)
     assert np.isnan(log.innovations[:4]).all()
     assert slam.landmarks().ids.tolist() == [3]
+
+
+@slam_filters
+def test_a_row_of_motion_that_was_used_comes_too_late_and_changes_nothing(kind):
+    slam, late = begun(kind, Calibration()), dvl(2, (0.1, 0.0, 0.0), rate_hz=7).rows(slice(9, 10))
+    slam.process(Measurements(later(2.0), imu(2), dvl(2)))
+    before = state_of(slam)
+    slam.process(Measurements(later(2.0), None, late))
+    (row,) = slam.refused_rows()
+    assert (row.sensor, row.stamp_ns, row.reason) == ("dvl", late.stamps_ns[0], Refusal.LATE)
+    for part, same in zip(state_of(slam), before, strict=True):
+        assert_array_equal(part, same)
 
 
 @pytest.mark.parametrize("rows", [{"detections": seen([T0_NS + 1])}, {"depth": depths(np.array([T0_NS + 1]), 0.0)}])
@@ -544,6 +556,27 @@ def in_a_gap(depth=None, detections=None):
     )
     rows = doppler.rows((seconds <= 2.0) | ((seconds >= 12.0) & (seconds <= 14.0)) | (seconds >= 24.0))
     return Sequence("gap", calibration, imu(25, force=NO_FORCE), rows, depth, detections)
+
+
+def test_a_gap_adds_what_an_unknown_gyro_bias_does_to_the_displacement_where_the_state_has_none():
+    """``sigma^2 J J^T``, J by the motion over the gap without one bias and another."""
+    sigma, step, end_ns = 0.01, 1e-5, later(3.0)
+    slam = begun(EkfSlam, Calibration(use_gravity=False, imu=ImuCalibration(gyro_bias_sigma=sigma)))
+    gyro = imu(3, (0.05, -0.1, 0.2), STANDARD_FORCE + np.array([0.1, -0.2, 0.0]))
+    covariance = slam.process(Measurements(end_ns, gyro, dvl(1, (0.4, 0.1, 0.0)))).covariance
+
+    def over_gap(bias):
+        return slam.odometry.motion(slam.state()[0], end_ns, bias)
+
+    over = over_gap(np.zeros(3))
+    ends = [[over_gap(side * step * e).i_T_j.translation() for side in (1, -1)] for e in np.eye(3)]
+    dR, dp = over.i_T_j.rotation().matrix(), over.i_T_j.translation()
+    J, C = dR.T @ np.array([(a - b) / (2 * step) for a, b in ends]).T, over.covariance.copy()
+    C[3:, 3:] += sigma**2 * J @ J.T
+    expected = slam.pose_after(Motion(np.ascontiguousarray(dR), dp, C, over.D_bias, np.zeros(3)))[2]
+    assert_allclose(covariance, expected, rtol=1e-5, atol=1e-5 * np.abs(expected).max())
+    assert np.abs(J @ J.T - J.T @ J).max() > 0.05 * np.linalg.norm(J) ** 2  # else the order would not be seen
+    assert sigma**2 * np.linalg.norm(J) ** 2 > 0.1 * np.trace(covariance[3:, 3:])
 
 
 @slam_filters
