@@ -24,8 +24,7 @@ import numpy as np
 
 from baselines.filter import Motion, SonarModel, correction, far_view, is_inside, polar_covariance
 from sonar_graph.measurements import Floats
-from sonar_graph.numerics import compiled, inlined
-from sonar_graph.numerics.matrices import (
+from sonar_graph.numerics import (
     I3,
     O3,
     Mat3,
@@ -33,9 +32,11 @@ from sonar_graph.numerics.matrices import (
     Vec3,
     Vec6,
     body_rates_from_euler,
+    compiled,
     cross,
     euler_from_rotation,
     euler_rates_from_body,
+    inlined,
     mat,
     mat6,
     rotation_from_euler,

@@ -27,8 +27,7 @@ from sonar_graph.errors import EstimatorError, MeasurementError
 from sonar_graph.measurements import Floats, LandmarkDetections, Measurements
 from sonar_graph.motion import Motions, MotionSource
 from sonar_graph.navigation.alignment import earth_rate_in_world, tilt_sigma, up_direction
-from sonar_graph.numerics import compiled
-from sonar_graph.numerics.matrices import block, cross, exp_and_mean, mat, store, vec
+from sonar_graph.numerics import block, compiled, cross, exp_and_mean, mat, store, vec
 from sonar_graph.slam.landmarks import gate_threshold, identify
 from sonar_graph.slam.models import elevation_on_floor
 from sonar_graph.states import (

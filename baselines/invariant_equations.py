@@ -44,8 +44,7 @@ import numpy as np
 
 from baselines.filter import Motion, SonarModel, correction
 from sonar_graph.measurements import Floats
-from sonar_graph.numerics import compiled
-from sonar_graph.numerics.matrices import exp_and_mean, store, vec
+from sonar_graph.numerics import compiled, exp_and_mean, store, vec
 from sonar_graph.slam.models import project, sonar_point, sonar_point_jacobian
 
 THETA, BETA, BODY = slice(0, 3), slice(3, 6), slice(6, 9)

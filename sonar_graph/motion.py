@@ -26,14 +26,12 @@ class PreintegratedMotion:
 
     Examples
     --------
-    Ten steps of 0.1 s at 0.5 m/s, and the same again, as one motion:
+    A second at 0.5 m/s, and the same again, as one motion:
 
+    >>> import gtsam
     >>> import numpy as np
-    >>> from sonar_graph.navigation import Preintegrator
-    >>> from sonar_graph.navigation.preintegration import Steps
-    >>> zeros, ahead = np.zeros((10, 3)), np.tile([0.5, 0.0, 0.0], (10, 1))
-    >>> steps = Steps(np.full(10, 0.1), zeros, ahead, np.zeros((10, 3, 3)), zeros, zeros)
-    >>> motion = Preintegrator(1e-4, np.zeros(3)).integrate(steps, np.zeros(3))
+    >>> still, second = np.zeros(3), gtsam.Pose3(gtsam.Rot3(), np.array([0.5, 0.0, 0.0]))
+    >>> motion = PreintegratedMotion(second, 1e-4 * np.eye(6), np.zeros((6, 3)), still, 1.0, np.array([0.0, 0.0, 9.81]))
     >>> twice = motion.then(motion)
     >>> round(float(twice.i_T_j.x()), 6), round(twice.duration_s, 6)
     (1.0, 2.0)

@@ -26,7 +26,7 @@ def filters() -> str:
 def smoother() -> str:
     """Dead reckoning, iSAM2 and joint preintegration."""
     from sonar_graph import compare
-    from sonar_graph.navigation.preintegration import JointPreintegrator
+    from sonar_graph.navigation import JointPreintegrator
     from sonar_graph.testing import small_world
 
     world = small_world()

@@ -10,6 +10,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -18,8 +19,7 @@ from filterpy.kalman import ExtendedKalmanFilter
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import NS_PER_S, Floats
 from sonar_graph.navigation import Odometry, PreintegratedMotion
-from sonar_graph.navigation.alignment import gravity_direction, velocity_at_imu
-from sonar_graph.navigation.preintegration import Preintegrator, Steps
+from sonar_graph.navigation.alignment import gravity_direction
 from sonar_graph.sequence import Sequence
 from sonar_graph.slam.landmarks import gate_threshold, identify
 from sonar_graph.slam.models import FLOOR_GATE, elevation_on_floor, locate_jacobians, range_azimuth_jacobians
@@ -172,17 +172,20 @@ class _Feed:
     sequence: Sequence
     slam: FilterpySlam
     odometry: Odometry
-    preintegrator: Preintegrator
     node_ns: int
     opened_ns: int
     predicts_by_node: bool
     nodes: int = 0
 
     def advance(self, until_ns: int) -> None:
-        for node_ns in self.odometry.nodes(self.node_ns, until_ns).tolist():
-            steps = self.odometry.steps_between_nodes(self.node_ns, node_ns)
-            pieces = [steps] if self.predicts_by_node else [_row(steps, k) for k in range(len(steps))]
-            motions = [self.preintegrator.integrate(piece, NO_BIAS) for piece in pieces]
+        for node_ns in self.odometry.epochs(self.node_ns, until_ns).tolist():
+            cuts_ns = [self.node_ns, node_ns]
+            if not self.predicts_by_node:
+                inertial_ns = self.sequence.imu.stamps_ns
+                between = (inertial_ns > self.node_ns) & (inertial_ns < node_ns)
+                cuts_ns[1:1] = inertial_ns[between].tolist()
+            known_ns = int(self.odometry.reached_ns(np.array([node_ns]))[0])
+            motions = [self.odometry.motion(a, b, NO_BIAS, None, known_ns) for a, b in pairwise(cuts_ns)]
             self.slam.timed(lambda motions=motions: [self.slam.predict(motion) for motion in motions])  # type: ignore[misc]
             self.node_ns, self.nodes = node_ns, self.nodes + 1
             if self.slam.calibration.use_gravity and node_ns - self.opened_ns >= GRAVITY_INTERVAL_NS:
@@ -190,17 +193,11 @@ class _Feed:
 
     def gravity(self) -> None:
         calibration = self.slam.calibration
-        p_dvl, p_imu = calibration.dvl.mounting.translation_m, calibration.imu.mounting.translation_m
-        ends, variances = [], []
-        for node_ns in (self.opened_ns, self.node_ns):
-            velocity, cov, rate = self.odometry.velocity_at_node(node_ns)
-            ends.append(velocity_at_imu(velocity, rate, np.array(p_dvl), np.array(p_imu)))
-            variances.append(np.trace(cov) / 3)
-        steps = self.odometry.steps_between_nodes(self.opened_ns, self.node_ns)
-        motion = self.preintegrator.integrate(steps, NO_BIAS)
-        sigma_m_s = math.sqrt(0.5 * sum(variances))
+        (v_i, variance_i), (v_j, variance_j) = map(self.odometry.velocity_at_imu, (self.opened_ns, self.node_ns))
+        motion = self.odometry.motion(self.opened_ns, self.node_ns, NO_BIAS)
+        sigma_m_s = math.sqrt(0.5 * (variance_i + variance_j))
         self.opened_ns = self.node_ns
-        found = gravity_direction(motion, *ends, sigma_m_s, calibration.imu, calibration.gravity_m_s2)
+        found = gravity_direction(motion, v_i, v_j, sigma_m_s, calibration.imu, calibration.gravity_m_s2)
         if found is None:
             return
         up, sigma = found
@@ -209,7 +206,7 @@ class _Feed:
         self.slam.timed(lambda: self.slam.update_state(4, math.atan2(-up[0], level), sigma**2))
 
     def provisional(self, until_ns: int) -> PreintegratedMotion:
-        return self.preintegrator.integrate(self.odometry.steps_since_node(self.node_ns, until_ns), NO_BIAS)
+        return self.odometry.motion(self.node_ns, until_ns, NO_BIAS)
 
     def depth(self, row: int) -> None:
         depth = self.sequence.depth
@@ -246,19 +243,17 @@ def run(sequence: Sequence, until_ns: int, *, predicts_by_node: bool = False) ->
     """
     odometry = Odometry(sequence.calibration)
     odometry.add(sequence.imu, sequence.dvl)
-    start_ns = odometry.start_ns()
+    start_ns = odometry.start_by(until_ns)
     assert start_ns is not None
     slam = FilterpySlam(sequence.calibration)
-    preintegrator = Preintegrator.from_calibration(sequence.calibration)
-    feed = _Feed(sequence, slam, odometry, preintegrator, start_ns, start_ns, predicts_by_node)
+    feed = _Feed(sequence, slam, odometry, start_ns, start_ns, predicts_by_node)
     events = []
     if sequence.depth is not None:
         events += [(int(t), 0, row) for row, t in enumerate(sequence.depth.stamps_ns)]
     if sequence.detections is not None:
         events += [(int(t), 1, row) for row, t in enumerate(sequence.detections.stamps_ns)]
-    reached_ns = odometry.start_reached_ns(start_ns)
     for stamp_ns, kind, row in sorted(events):
-        if not reached_ns <= stamp_ns <= until_ns:
+        if stamp_ns > until_ns or odometry.start_by(stamp_ns) is None:
             continue
         feed.advance(stamp_ns)
         (feed.depth, feed.detection)[kind](row)
@@ -276,8 +271,3 @@ def body_rates(x: Floats) -> Floats:
             [0, -np.sin(roll), np.cos(roll) * np.cos(pitch)],
         ]
     )
-
-
-def _row(steps: Steps, k: int) -> Steps:
-    one = slice(k, k + 1)
-    return Steps(*(column[one] for column in vars(steps).values()))

@@ -29,7 +29,6 @@ from common import conclude, make_parser, note, print_table
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import LandmarkDetections, Measurements
 from sonar_graph.navigation import Odometry, PreintegratedMotion
-from sonar_graph.navigation.preintegration import Preintegrator
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
 from sonar_graph.slam.isam2 import Isam2
@@ -67,7 +66,6 @@ class PlainIsam2:
     def __init__(self, calibration: Calibration) -> None:
         self._calibration = calibration
         self._odometry = Odometry(calibration)
-        self._preintegrator = Preintegrator.from_calibration(calibration)
         self._isam = gtsam.ISAM2()
         self._body_T_sonar = calibration.sonar.mounting.pose()
         self._graph, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -83,7 +81,7 @@ class PlainIsam2:
             self._start(measurements.end_ns)
         if self._node_ns is not None and measurements.detections is not None:
             frame_ns = int(measurements.detections.stamps_ns[-1])
-            nodes = self._odometry.nodes(self._node_ns, frame_ns)
+            nodes = self._odometry.epochs(self._node_ns, frame_ns)
             if len(nodes):
                 self._add_pose(int(nodes[-1]), measurements)
             self._add_sightings(measurements.detections)
@@ -100,8 +98,7 @@ class PlainIsam2:
         self._graph.push_back(factors.start_prior(X(0), self._calibration))
 
     def _add_pose(self, node_ns: int, measurements: Measurements) -> None:
-        steps = self._odometry.steps_between_nodes(self._node_ns, node_ns)
-        motion = self._preintegrator.integrate(steps, NO_BIAS)
+        motion = self._odometry.motion(self._node_ns, node_ns, NO_BIAS)
         self._pose = self._pose.compose(motion.i_T_j)
         self._graph.push_back(self._odometry_factor(motion))
         self._index += 1
@@ -117,9 +114,7 @@ class PlainIsam2:
         return factors.odometry(X(self._index), X(self._index + 1), motion)
 
     def _add_sightings(self, detections: LandmarkDetections) -> None:
-        motion = self._preintegrator.integrate(
-            self._odometry.steps_since_node(self._node_ns, int(detections.stamps_ns[-1])), NO_BIAS
-        )
+        motion = self._odometry.motion(self._node_ns, int(detections.stamps_ns[-1]), NO_BIAS)
         body_T_sonar = motion.i_T_j.compose(self._body_T_sonar)
         ids, probabilities = detections.most_probable()
         for row in np.flatnonzero(probabilities > 0.7).tolist():

@@ -37,20 +37,19 @@ from spline_vehicle import BODY_P_DVL, BODY_P_IMU, BODY_R_DVL, Vehicle, make_veh
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.logs.convert import read_akit
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints
-from sonar_graph.navigation import Odometry, motion_between_nodes
+from sonar_graph.navigation import (
+    DISPLACEMENT,
+    DopplerRule,
+    JointMotion,
+    JointPreintegrator,
+    Odometry,
+)
 from sonar_graph.navigation.alignment import (
     earth_rate_in_world,
     gravity_direction,
     match_dvl_to_imu,
     match_reference_to_imu,
     velocity_at_imu,
-)
-from sonar_graph.navigation.preintegration import (
-    DISPLACEMENT,
-    DopplerRule,
-    JointMotion,
-    JointPreintegrator,
-    Preintegrator,
 )
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import BasinOptions, simulate_basin
@@ -260,7 +259,7 @@ def as_gaps(vehicle: Vehicle, start_s: float, case: Case, rows: tuple[Imu, Dvl])
     )
     odometry, end_ns = Odometry(calibration), round(case.keyframe_s * NS)
     odometry.add(*rows)
-    motion = motion_between_nodes(odometry, Preintegrator.from_calibration(calibration), 0, end_ns, np.zeros(3), None)
+    motion = odometry.motion(0, end_ns, np.zeros(3))
     ends = np.array([start_s, start_s + case.keyframe_s])
     R_i, R_j = vehicle.attitude(ends)
     p_i, p_j = vehicle.position(ends)

@@ -32,7 +32,7 @@ from common import in_parallel, make_parser, print_figures, print_table
 from spline_vehicle import BODY_P_DVL, BODY_P_IMU, BODY_R_DVL, GRAVITY, Vehicle, make_vehicle
 
 from sonar_graph.measurements import Dvl, Imu
-from sonar_graph.navigation.preintegration import DISPLACEMENT, JointMotion, JointPreintegrator
+from sonar_graph.navigation import DISPLACEMENT, JointMotion, JointPreintegrator
 
 NS = 1_000_000_000
 IMU_HZ, ACCEL_DENSITY = 200.0, 1e-3

@@ -10,7 +10,7 @@ import numpy as np
 from gtsam.symbol_shorthand import L, X
 
 from sonar_graph.logs import read_log, write_log
-from sonar_graph.navigation import Odometry, Preintegrator
+from sonar_graph.navigation import Odometry
 from sonar_graph.simulation import BasinOptions, simulate_basin
 from sonar_graph.slam import Isam2, Isam2Params, KeyframeParams
 from sonar_graph.slam.models import factors
@@ -23,13 +23,12 @@ calibration = sequence.calibration
 print(f"IMU: angular velocity {sequence.imu.angular_velocity.shape} rad/s, from {sequence.imu.stamps_ns[0]} ns")
 
 # 2. Preintegration between two instants. Gyro and Doppler rows are merged into steps, the steps into one motion with
-# one joint covariance. Epochs, the stamps of the Doppler log, are where a motion can begin and end.
+# one joint covariance. Between epochs, the stamps of the Doppler log, a motion is final.
 odometry = Odometry(calibration)
 odometry.add(sequence.imu, sequence.dvl)
-preintegrator = Preintegrator.from_calibration(calibration)
-nodes = odometry.nodes(sequence.start_ns, sequence.end_ns)
-start_ns, end_ns = int(nodes[70]), int(nodes[140])
-motion = preintegrator.integrate(odometry.steps_between_nodes(start_ns, end_ns), bias=np.zeros(3))
+epochs = odometry.epochs(sequence.start_ns, sequence.end_ns)
+start_ns, end_ns = int(epochs[70]), int(epochs[140])
+motion = odometry.motion(start_ns, end_ns, bias=np.zeros(3))
 moved_m = np.linalg.norm(motion.i_T_j.translation())
 sigmas = np.sqrt(np.diag(motion.covariance))
 print(f"\nin {motion.duration_s:.2f} s: {moved_m:.3f} m")
@@ -53,8 +52,8 @@ graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
 pose = calibration.start.pose()
 graph.push_back(factors.start_prior(X(0), calibration))
 values.insert(X(0), pose)
-for index, (before_ns, after_ns) in enumerate([(int(nodes[0]), start_ns), (start_ns, end_ns)]):
-    step = preintegrator.integrate(odometry.steps_between_nodes(before_ns, after_ns), bias=np.zeros(3))
+for index, (before_ns, after_ns) in enumerate([(int(epochs[0]), start_ns), (start_ns, end_ns)]):
+    step = odometry.motion(before_ns, after_ns, bias=np.zeros(3))
     pose = pose.compose(step.i_T_j)
     graph.push_back(factors.odometry(X(index), X(index + 1), step))
     values.insert(X(index + 1), pose)

@@ -4,16 +4,15 @@ For use in any GTSAM program: docs/tutorials/05_preintegration.py; factors: `son
 """
 
 # fmt: off
-from sonar_graph.navigation.alignment import InitialTilt, align_at_rest, align_in_motion
 from sonar_graph.motion import Motions, MotionSource, PreintegratedMotion
-from sonar_graph.navigation.odometry import (
-    Odometry, RunningMotion, motion_between, motion_between_nodes, motion_since_node,
+from sonar_graph.navigation.alignment import InitialTilt, align_at_rest, align_in_motion
+from sonar_graph.navigation.joint_preintegration import (
+    DISPLACEMENT, ROTATION, DopplerRule, JointMotion, JointPreintegrator,
 )
-from sonar_graph.navigation.preintegration import JointMotion, JointPreintegrator, Preintegrator
-from sonar_graph.navigation.samples import finite_vector, in_numbers, rows_until, value_at
+from sonar_graph.navigation.odometry import Odometry
+from sonar_graph.navigation.samples import finite_vector, in_numbers
 
 __all__ = [
-    "InitialTilt", "JointMotion", "JointPreintegrator", "MotionSource", "Motions", "Odometry", "PreintegratedMotion",
-    "Preintegrator", "RunningMotion", "align_at_rest", "align_in_motion", "finite_vector", "in_numbers",
-    "motion_between", "motion_between_nodes", "motion_since_node", "rows_until", "value_at",
+    "DISPLACEMENT", "DopplerRule", "InitialTilt", "JointMotion", "JointPreintegrator", "MotionSource", "Motions",
+    "Odometry", "PreintegratedMotion", "ROTATION", "align_at_rest", "align_in_motion", "finite_vector", "in_numbers",
 ]

@@ -22,8 +22,7 @@ import numpy as np
 
 from sonar_graph.calibration import HOLE_INTERVALS, ROWS_BEFORE, SHORTEST_HOLE_S, UNTYPICAL_S, ImuCalibration
 from sonar_graph.measurements import Ints
-from sonar_graph.numerics import ZERO, Vector, compiled, inlined, plus, scaled
-from sonar_graph.numerics.matrices import Vec3
+from sonar_graph.numerics import Vec3, compiled
 
 UNTYPICAL_NS = round(UNTYPICAL_S * 1e9)
 UNFELT_NS = 100_000_000
@@ -32,85 +31,6 @@ unseen."""
 SHORTEST_NS = round(SHORTEST_HOLE_S * 1e9)
 SHORT = 0.03
 """T / c below which two terms of a series are exact to 1e-3 and differences of large numbers are not."""
-TurnValues = tuple[Vector, Vector, float]
-"""About each body axis: sigma of the rate, rad/s, and its time, s. White noise of the gyros, rad/s/√Hz."""
-NO_TURNS: TurnValues = (ZERO, (1.0, 1.0, 1.0), 0.0)
-"""Values with which no interval is a hole."""
-
-
-def turn_values(imu: ImuCalibration) -> TurnValues:
-    """The turn values of a calibration."""
-    return imu.turn_sigma_rad_s, imu.turn_time_s, imu.gyro_noise_density
-
-
-@compiled
-def hole_ns(stamps: Ints, rows: int, row: int, until_ns: int) -> int:
-    """Length of the hole before a row; 0 where there is none.
-
-    Only the first ``rows`` stamps are known; ``row = rows`` means a hole that is open, and lasts until ``until_ns`` so
-    far.
-    """
-    if row <= 0:
-        return 0
-    last = min(row, rows) - 1
-    length_ns = (stamps[row] if row < rows else until_ns) - stamps[last]
-    if length_ns <= SHORTEST_NS:
-        return 0
-    first, shorter = max(last - ROWS_BEFORE, 0), 0
-    for k in range(first, last):
-        shorter += int(HOLE_INTERVALS * (stamps[k + 1] - stamps[k]) < length_ns)
-    is_hole = 2 * shorter >= last - first if last > first else length_ns > UNTYPICAL_NS
-    return length_ns if is_hole else 0
-
-
-@compiled
-def row_after_hole(stamps: Ints, first: int, last: int, longest_ns: int) -> int:
-    """The row after the first hole between two rows that lasts longer; -1 where there is none."""
-    for row in range(first + 1, last + 1):
-        if stamps[row] - stamps[row - 1] > longest_ns and hole_ns(stamps, len(stamps), row, stamps[row]) > 0:
-            return row
-    return -1
-
-
-@inlined
-def force_outside_holes(force: Vector, turns: TurnValues, stamps: Ints, rows: int, row: int, until_ns: int) -> Vector:
-    """The specific force up to an instant; NaN in a hole."""
-    if turns[0] != ZERO and hole_ns(stamps, rows, row, until_ns) > UNFELT_NS:
-        return np.nan, np.nan, np.nan
-    return force
-
-
-@inlined
-def turn_psd(turns: TurnValues, stamps: Ints, rows: int, row: int, t: int, until_ns: int) -> Vector:
-    """Spectral density of the error of the rates from t to an instant, with no row in between; rad²/s."""
-    psd = ZERO
-    if turns[0] != ZERO:
-        length_ns = hole_ns(stamps, rows, row, until_ns)
-        if length_ns > 0:
-            psd = hole_psd(turns, stamps, min(row, rows) - 1, length_ns * 1e-9, (until_ns - t) * 1e-9, row < rows)
-    return psd
-
-
-@compiled
-def hole_psd(turns: TurnValues, stamps: Ints, row: int, length_s: float, step_s: float, is_closed: bool) -> Vector:
-    """Spectral density in a hole after a row: the mean over a closed one, the last step's growth of an open one."""
-    (x, y, z), (c_x, c_y, c_z), gyro_density = turns
-    first = max(row - ROWS_BEFORE, 0)
-    row_variance = 0.0
-    if row > first:
-        row_variance = gyro_density * gyro_density / (np.median(np.diff(stamps[first : row + 1])) * 1e-9)
-    if is_closed:
-        by_rows = 0.5 * row_variance * length_s
-        grown = closed_variance(x, c_x, length_s), closed_variance(y, c_y, length_s), closed_variance(z, c_z, length_s)
-        return plus(scaled(1.0 / length_s, grown), (by_rows, by_rows, by_rows))
-    before_s = length_s - step_s
-    by_row = row_variance * (length_s + before_s)
-    grown = (
-        open_variance(x, c_x, length_s) - open_variance(x, c_x, before_s),
-        open_variance(y, c_y, length_s) - open_variance(y, c_y, before_s),
-        open_variance(z, c_z, length_s) - open_variance(z, c_z, before_s),
-    )
-    return plus(scaled(1.0 / step_s, grown), (by_row, by_row, by_row))
 
 
 class Turns(NamedTuple):
@@ -131,6 +51,11 @@ def turns_of(imu: ImuCalibration) -> Turns:
     return Turns(is_modelled, Vec3(*imu.turn_sigma_rad_s), Vec3(*imu.turn_time_s), imu.gyro_noise_density)
 
 
+ONES = Vec3(1.0, 1.0, 1.0)
+UNTURNED = Turns(False, ONES, ONES, 0.0)
+"""With it no interval is a hole."""
+
+
 @compiled
 def typical_ns(stamps: Ints, row: int) -> int:
     """Median of the `ROWS_BEFORE` intervals before a row, of an even number the shorter; 0 where there is none."""
@@ -143,6 +68,32 @@ def typical_ns(stamps: Ints, row: int) -> int:
         if 2 * shorter < row - first <= 2 * (shorter + same):
             return stamps[k + 1] - stamps[k]
     return 0
+
+
+@compiled
+def hole_ns(stamps: Ints, rows: int, row: int, until_ns: int) -> int:
+    """Length of the hole before a row; 0 where there is none.
+
+    Only the first ``rows`` stamps are known; ``row = rows`` means a hole that is open, and lasts until ``until_ns`` so
+    far.
+    """
+    if row <= 0:
+        return 0
+    last = min(row, rows) - 1
+    length_ns = (stamps[row] if row < rows else until_ns) - stamps[last]
+    if length_ns <= SHORTEST_NS:
+        return 0
+    typical = typical_ns(stamps, last)
+    return length_ns if length_ns > (HOLE_INTERVALS * typical if typical > 0 else UNTYPICAL_NS) else 0
+
+
+@compiled
+def row_after_hole(stamps: Ints, first: int, last: int, longest_ns: int) -> int:
+    """The row after the first hole between two rows that lasts longer; -1 where there is none."""
+    for row in range(first + 1, last + 1):
+        if stamps[row] - stamps[row - 1] > longest_ns and hole_ns(stamps, len(stamps), row, stamps[row]) > 0:
+            return row
+    return -1
 
 
 @compiled
@@ -162,11 +113,6 @@ def error_in_hole(turns: Turns, stamps: Ints, rows: int, row: int, t: int, until
         open_variance(s.x, c.x, before_s), open_variance(s.y, c.y, before_s), open_variance(s.z, c.z, before_s)
     )
     return (1.0 / (T - before_s)) * grown + by_row * (T + before_s) * ONES
-
-
-ONES = Vec3(1.0, 1.0, 1.0)
-UNTURNED = Turns(False, ONES, ONES, 0.0)
-"""With it no interval is a hole."""
 
 
 @compiled

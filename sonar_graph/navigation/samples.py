@@ -1,8 +1,4 @@
-"""Rows of a sensor by their stamps: storage, values in between, and checks of what a caller gives.
-
-``linear``: rate and velocity are piecewise linear through the samples; the mean over a step is the value at its middle.
-``hold-past``: a sample is the mean over the interval that ends at its stamp.
-"""
+"""Rows of a sensor by their stamps: storage, and checks of what a caller gives."""
 
 from math import isfinite
 
@@ -13,7 +9,7 @@ from sonar_graph.calibration import Calibration
 from sonar_graph.devices import UNMEASURED_M_S
 from sonar_graph.errors import CalibrationError, MeasurementError, SonarGraphError
 from sonar_graph.measurements import Floats, Ints
-from sonar_graph.numerics import Vector, compiled, inlined, minus, plus, scaled, vector
+from sonar_graph.numerics import compiled
 
 EARLIEST_NS, LATEST_NS = np.iinfo(np.int64).min, np.iinfo(np.int64).max
 WINDOW_NS = 5_000_000_000
@@ -50,69 +46,6 @@ class StampedRows:
     def _keep(self, rows: slice | Ints) -> None:
         self.stamps_ns = self.stamps_ns[rows]
         self.values = self.values[0][rows], self.values[1][rows]
-
-
-@compiled
-def node_range(imu_ns: Ints, dvl_ns: Ints, after_ns: int, until_ns: int) -> tuple[int, int]:
-    """Rows of the DVL that are epochs after one instant and reached at another: the first, and one past the last."""
-    seen = np.searchsorted(imu_ns, until_ns, side="right")
-    if seen == 0:
-        return 0, 0
-    covered_ns = min(until_ns, imu_ns[seen - 1])
-    first = np.searchsorted(dvl_ns, after_ns, side="right")
-    return int(first), max(int(first), int(np.searchsorted(dvl_ns, covered_ns, side="right")))
-
-
-@compiled
-def rows_before_gaps(stamps: Ints, start_ns: int, end_ns: int, longest_ns: int) -> Ints:
-    """Rows between two stamps whose next row comes more than ``longest_ns`` later."""
-    first, last = np.searchsorted(stamps, start_ns), np.searchsorted(stamps, end_ns)
-    return np.flatnonzero(np.diff(stamps[first : last + 1]) > longest_ns) + first
-
-
-@inlined
-def rows_until(stamps: Ints, instant_ns: int) -> int:
-    """Number of rows stamped at or before an instant (numpy's search with a side is slow to compile)."""
-    low, high = 0, len(stamps)
-    while low < high:
-        middle = (low + high) // 2
-        if stamps[middle] <= instant_ns:
-            low = middle + 1
-        else:
-            high = middle
-    return low
-
-
-@inlined
-def bracket(stamps: Ints, n: int, i: int, t: int, hold_past: bool) -> tuple[int, int, float]:
-    """Rows before and after t and the share of the later, where ``stamps[i - 1] < t <= stamps[i]``.
-
-    Outside the first n rows the nearest row holds.
-    """
-    if i >= n:
-        return n - 1, n - 1, 0.0
-    if hold_past or i == 0:
-        return i, i, 0.0
-    return i - 1, i, (t - stamps[i - 1]) / (stamps[i] - stamps[i - 1])
-
-
-@inlined
-def value_at(stamps: Ints, values: Floats, i: int, t: int, hold_past: bool) -> Vector:
-    """Value at t, where ``stamps[i - 1] < t <= stamps[i]``; that of the nearest row outside the rows."""
-    return value_among(stamps, values, len(stamps), i, t, hold_past)
-
-
-@inlined
-def value_among(stamps: Ints, values: Floats, rows: int, i: int, t: int, hold_past: bool) -> Vector:
-    """Value at t from the first ``rows`` rows only."""
-    return between(values, *bracket(stamps, rows, i, t, hold_past))
-
-
-@inlined
-def between(values: Floats, before: int, after: int, share: float) -> Vector:
-    """Linear interpolation between two rows."""
-    a, b = vector(values[before]), vector(values[after])
-    return plus(a, scaled(share, minus(b, a)))
 
 
 UNITS_NS = {"seconds": 1_000_000_000, "milliseconds": 1_000_000, "microseconds": 1_000}

@@ -1,20 +1,18 @@
-"""Compiled functions, and vectors and matrices of three rows inside them."""
+"""Compiled functions, and rotations, vectors and matrices inside them."""
 
 # fmt: off
 from sonar_graph.numerics.compiling import compiling_s
 from sonar_graph.numerics.jit import compiled, inlined
-from sonar_graph.numerics.mat3 import (
-    IDENTITY, ZERO, ZEROS, Matrix, Vector, cross, difference_of, dot, euler_from_rates, euler_from_rotation, gram,
-    left_jacobian, matrix, minus, multiple_of, place, plus, product, rates_from_euler, rotation_exp,
-    rotation_from_euler, sandwich, scaled, skew, skew_times, sum_of, symmetric, times, times_skew, transformed,
-    transposed, vector,
+from sonar_graph.numerics.matrices import (
+    I3, O3, O6, ZERO, Mat3, Mat6, Skew, Vec3, Vec6, adjoint, block, body_rates_from_euler, cross, diagonal,
+    euler_from_rotation, euler_rates_from_body, exp_and_mean, inverse_adjoint, mat, mat6, rotation_from_euler,
+    running_rotations, skew, store, store6, vec,
 )
-from sonar_graph.numerics.matrices import running_rotations
+from sonar_graph.numerics.rotations import cross_matrix, left_jacobian, rotation_exp
 
 __all__ = [
-    "IDENTITY", "Matrix", "Vector", "ZERO", "ZEROS", "compiled", "compiling_s", "cross", "difference_of", "dot",
-    "euler_from_rates", "euler_from_rotation", "gram", "inlined", "left_jacobian", "matrix", "minus", "multiple_of",
-    "place", "plus", "product", "rates_from_euler", "rotation_exp", "rotation_from_euler", "running_rotations",
-    "sandwich", "scaled", "skew", "skew_times", "sum_of", "symmetric", "times", "times_skew", "transformed",
-    "transposed", "vector",
+    "I3", "Mat3", "Mat6", "O3", "O6", "Skew", "Vec3", "Vec6", "ZERO", "adjoint", "block", "body_rates_from_euler",
+    "compiled", "compiling_s", "cross", "cross_matrix", "diagonal", "euler_from_rotation", "euler_rates_from_body",
+    "exp_and_mean", "inlined", "inverse_adjoint", "left_jacobian", "mat", "mat6", "rotation_exp",
+    "rotation_from_euler", "running_rotations", "skew", "store", "store6", "vec",
 ]

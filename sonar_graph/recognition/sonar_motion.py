@@ -7,9 +7,8 @@ depth and the calibration's floor. Nothing stamped after a frame is used for it.
 import numpy as np
 
 from sonar_graph.measurements import NS_PER_S, Depth, Floats
-from sonar_graph.navigation import Odometry, PreintegratedMotion, motion_between, motion_between_nodes
-from sonar_graph.navigation.alignment import gravity_direction, velocity_at_imu
-from sonar_graph.navigation.preintegration import Preintegrator
+from sonar_graph.navigation import MotionSource, Odometry, PreintegratedMotion
+from sonar_graph.navigation.alignment import gravity_direction
 from sonar_graph.sequence import Sequence
 from sonar_graph.sonar import FloorView, SonarStep
 
@@ -21,27 +20,27 @@ _NO_BIAS = np.zeros(3)
 class _Tilt:
     """Direction of up in the body: a Kalman filter with one variance, predicted by gyros, corrected by gravity."""
 
-    def __init__(self, sequence: Sequence, odometry: Odometry, preintegrator: Preintegrator) -> None:
+    def __init__(self, sequence: Sequence, odometry: MotionSource) -> None:
         calibration = sequence.calibration
-        self._calibration, self._odometry, self._preintegrator = calibration, odometry, preintegrator
-        self.node_ns = sequence.start_ns
+        self._calibration, self._odometry = calibration, odometry
+        self.epoch_ns = sequence.start_ns
         self.up: Floats = calibration.start.pose().rotation().matrix()[2]
         self.variance = float(np.max(np.square(calibration.start.rpy_sigma_rad[:2])))
 
     def reach(self, instant_ns: int) -> None:
         """Predict and correct until an instant."""
-        for node_ns in self._odometry.nodes(self.node_ns + GRAVITY_INTERVAL_NS - 1, instant_ns).tolist():
-            if node_ns - self.node_ns < GRAVITY_INTERVAL_NS:
+        for epoch_ns in self._odometry.epochs(self.epoch_ns + GRAVITY_INTERVAL_NS - 1, instant_ns).tolist():
+            if epoch_ns - self.epoch_ns < GRAVITY_INTERVAL_NS:
                 continue
-            motion = motion_between_nodes(self._odometry, self._preintegrator, self.node_ns, node_ns, _NO_BIAS, None)
-            measured = self._gravity(motion, node_ns) if self._calibration.use_gravity else None
+            motion = self._odometry.motion(self.epoch_ns, epoch_ns, _NO_BIAS)
+            measured = self._gravity(motion, epoch_ns) if self._calibration.use_gravity else None
             self.up, self.variance = self.after(motion)
             if measured is not None:
                 direction, sigma = measured
                 gain = self.variance / (self.variance + sigma**2)
                 self.up = _unit(self.up + gain * (direction - self.up))
                 self.variance *= 1 - gain
-            self.node_ns = node_ns
+            self.epoch_ns = epoch_ns
 
     def after(self, motion: PreintegratedMotion) -> tuple[Floats, float]:
         """Up in the body and its variance after a motion since the last correction."""
@@ -49,12 +48,10 @@ class _Tilt:
         noise = float(np.max(np.diag(motion.covariance)[:3]))
         return motion.i_T_j.rotation().matrix().T @ self.up, self.variance + noise + drift**2
 
-    def _gravity(self, motion: PreintegratedMotion, node_ns: int) -> tuple[Floats, float] | None:
+    def _gravity(self, motion: PreintegratedMotion, epoch_ns: int) -> tuple[Floats, float] | None:
         """Measured direction of up at an epoch, and its standard deviation."""
-        ends = [self._odometry.velocity_at_node(at_ns) for at_ns in (self.node_ns, node_ns)]
-        imu, dvl = (np.array(m.translation_m) for m in (self._calibration.imu.mounting, self._calibration.dvl.mounting))
-        before, after = (velocity_at_imu(velocity, rate, dvl, imu) for velocity, _, rate in ends)
-        sigma = float(np.sqrt(np.mean([np.trace(cov) / 3 for _, cov, _ in ends])))
+        (before, variance), (after, other) = map(self._odometry.velocity_at_imu, (self.epoch_ns, epoch_ns))
+        sigma = float(np.sqrt(0.5 * (variance + other)))
         return gravity_direction(motion, before, after, sigma, self._calibration.imu, self._calibration.gravity_m_s2)
 
 
@@ -94,8 +91,7 @@ class SonarMotions:
         calibration = sequence.calibration
         self._odometry = Odometry(calibration)
         self._odometry.add(sequence.imu, sequence.dvl)
-        self._preintegrator = Preintegrator.from_calibration(calibration)
-        self._tilt = _Tilt(sequence, self._odometry, self._preintegrator)
+        self._tilt = _Tilt(sequence, self._odometry)
         self._height = _Height(sequence.depth, sequence)
         self._floor = calibration.floor if sequence.depth is not None else None
         self._body_T_sonar = calibration.sonar.mounting.pose()
@@ -116,9 +112,9 @@ class SonarMotions:
 
         The motion of the first frame is None, and so is the view where the height is not known or not positive.
         """
-        motion, step, view = self._between(self._stamp_ns, stamp_ns), None, None
+        motion, step, view = self._odometry.motion(self._stamp_ns, stamp_ns, _NO_BIAS), None, None
         self._tilt.reach(stamp_ns)
-        up, tilt_variance = self._tilt.after(self._between(self._tilt.node_ns, stamp_ns))
+        up, tilt_variance = self._tilt.after(self._odometry.motion(self._tilt.epoch_ns, stamp_ns, _NO_BIAS))
         body_R_previous = motion.i_T_j.rotation().matrix().T
         climbed = up @ body_R_previous @ motion.i_T_j.translation()
         self._height.carry(float(climbed), float(np.trace(motion.covariance[3:, 3:])) / 3)
@@ -136,9 +132,6 @@ class SonarMotions:
                 sigma_m = float(np.hypot(np.sqrt(self._height.variance), self._floor.sigma_m))
                 view = FloorView(level_R_sonar, height_m, sigma_m, float(np.sqrt(tilt_variance)))
         return step, view
-
-    def _between(self, start_ns: int, end_ns: int) -> PreintegratedMotion:
-        return motion_between(self._odometry, self._preintegrator, start_ns, end_ns, _NO_BIAS)
 
 
 def level_from_up(up: Floats) -> Floats:

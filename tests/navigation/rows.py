@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -12,7 +13,6 @@ from scipy.linalg import expm
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints
 from sonar_graph.navigation.odometry import Odometry
-from sonar_graph.navigation.preintegration.recursion import Steps
 
 NS = 1_000_000_000
 T0_NS = 1_700_000_000 * NS
@@ -54,22 +54,40 @@ def waves(stamps_ns: Ints, seed: int, amplitude: float) -> Floats:
     return amplitude * np.sin(2 * np.pi * t / period[0] + phase[0]) * np.cos(2 * np.pi * t / period[1] + phase[1])
 
 
-def random_steps(seed: int, n: int = 60, rate_rad_s: float = 0.8) -> Steps:
-    """Brisk motion with a different full covariance at every step."""
-    rng = np.random.default_rng(seed)
-    root = 0.01 * rng.standard_normal((n, 3, 3))
-    return Steps(
-        duration_s=rng.uniform(0.004, 0.012, n),
-        rate=rate_rad_s * rng.standard_normal((n, 3)),
-        velocity=np.array([0.5, 0.0, 0.0]) + 0.3 * rng.standard_normal((n, 3)),
-        velocity_psd=root @ np.swapaxes(root, 1, 2),
-        specific_force=np.array([0.0, 0.0, 9.8]) + rng.standard_normal((n, 3)),
-        turn_psd=np.zeros((n, 3)),
-    )
+class Steps(NamedTuple):
+    """Constant rate and velocity over each of n steps, and the density of the velocity's noise."""
+
+    duration_s: Floats
+    rate: Floats
+    velocity: Floats
+    velocity_psd: Floats
+    force: Floats
 
 
-def part(steps: Steps, first: int, last: int) -> Steps:
-    return Steps(*(column[first:last] for column in vars(steps).values()))
+def steps_of(imu: Imu, dvl: Dvl, start_ns: int, end_ns: int, known_ns: int, hold_past: bool) -> Steps:
+    """Cut at every known stamp of either sensor, by numpy's interpolation at the middles.
+
+    Doppler noise: half of either end's covariance over the interval about a step; past the rows that of the last one.
+    """
+    inertial, log = (rows.between(0, known_ns) for rows in (imu, dvl))
+    cuts = np.concatenate([inertial.stamps_ns, log.stamps_ns])
+    cuts = np.unique(np.r_[start_ns, end_ns, cuts[(cuts > start_ns) & (cuts < end_ns)]])
+    middles = cuts[:-1] + np.diff(cuts) // 2
+
+    def sampled(stamps: Ints, values: Floats) -> Floats:
+        if hold_past:
+            return values[np.minimum(np.searchsorted(stamps, middles), len(stamps) - 1)]
+        t, knots = (middles - start_ns).astype(float), (stamps - start_ns).astype(float)
+        return np.column_stack([np.interp(t, knots, column) for column in values.T])
+
+    psd = np.zeros((len(middles), 3, 3))
+    for n, k in enumerate(np.searchsorted(log.stamps_ns, middles).tolist()):
+        last = min(k, len(log) - 1)
+        ends = (last, last) if hold_past or k >= len(log) else (last, last - 1)
+        if last > 0:
+            psd[n] = np.diff(log.stamps_ns)[last - 1] * 1e-9 * log.velocity_cov[list(ends)].mean(axis=0)
+    rate, force = (sampled(inertial.stamps_ns, c) for c in (inertial.angular_velocity, inertial.specific_force))
+    return Steps(np.diff(cuts) * 1e-9, rate, sampled(log.stamps_ns, log.velocity), psd, force)
 
 
 def dead_reckoned(steps: Steps, bias: Floats, lever: Floats) -> list[gtsam.Pose3]:

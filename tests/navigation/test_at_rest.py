@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.errors import AlignmentError
 from sonar_graph.measurements import Dvl, Floats, Imu
-from sonar_graph.navigation import PreintegratedMotion, Preintegrator
+from sonar_graph.navigation import PreintegratedMotion
 from sonar_graph.navigation.alignment.allan import allan_deviation, degrees_of_freedom, density, noise_densities
 from sonar_graph.navigation.alignment.at_rest import (
     InitialTilt,
@@ -23,11 +23,11 @@ from sonar_graph.navigation.alignment.at_rest import (
     in_body_axes,
     roll_and_pitch,
 )
-from sonar_graph.navigation.alignment.gravity import earth_rate_in_world, gravity_direction, velocity_at_imu
-from sonar_graph.navigation.preintegration.recursion import Steps
+from sonar_graph.navigation.alignment.gravity import earth_rate_in_world, gravity_direction
 from sonar_graph.testing import check_consistent
 
-from .rows import derivative, dvl
+from . import ways
+from .rows import NS, at, derivative, dvl
 from .ways import acceleration_at, attitude, rate_at, velocity_at
 
 G, HZ, REST_S = 9.80665, 50, 20.0
@@ -242,11 +242,13 @@ T, N, FROM_S = 1.0, 2000, 2.0
 
 def accelerated() -> tuple[PreintegratedMotion, Floats, Floats, Rotation]:
     """A turning, swaying vehicle's motion over T, its velocities in the body at both ends, and its last attitude."""
-    t = FROM_S + (np.arange(N) + 0.5) * T / N
+    stamps_ns = at(FROM_S) + (np.arange(N + 1) * T / N * NS).astype(np.int64)
+    t = (stamps_ns - at(0.0)) * 1e-9
     force = attitude(t).inv().apply(acceleration_at(t) + GRAVITY)
-    velocity = attitude(t).inv().apply(velocity_at(t))
-    steps = Steps(np.full(N, T / N), rate_at(t), velocity, np.zeros((N, 3, 3)), force, np.zeros((N, 3)))
-    motion, ends = Preintegrator(0.0, np.zeros(3)).integrate(steps, np.zeros(3)), np.array([FROM_S, FROM_S + T])
+    log = dvl(stamps_ns, attitude(t).inv().apply(velocity_at(t)))
+    agile = Calibration(dvl=DvlCalibration(velocity_walk_density=10.0))
+    motion = ways.motion(Imu(stamps_ns, rate_at(t), force), log, agile, FROM_S, FROM_S + T)
+    ends = np.array([FROM_S, FROM_S + T])
     return motion, *attitude(ends).inv().apply(velocity_at(ends)), attitude(ends)[1]
 
 
@@ -322,13 +324,6 @@ def test_what_the_gyros_do_meanwhile_is_in_the_tilt(duration_s):
 def test_without_forces_there_is_no_direction():
     unfelt = replace(accelerated()[0], mean_specific_force=np.full(3, np.nan))
     assert gravity_direction(unfelt, np.zeros(3), np.zeros(3), 0.01, IMU, G) is None
-
-
-def test_velocity_at_the_imu_is_that_of_a_point_of_a_rigid_body():
-    """Differences of the two points' positions on a turning body."""
-    v_dvl, w, body_p_dvl, arm = np.array([[0.5, 0.1, 0], [0.15, -0.1, 0.3], [-0.2, 0.1, -0.1], [0.5, -0.1, 0.3]])
-    moved = gtsam.Pose3.Expmap(1e-6 * np.concatenate([w, v_dvl])).transformFrom(arm)
-    assert velocity_at_imu(v_dvl, w, body_p_dvl, body_p_dvl + arm) == pytest.approx((moved - arm) / 1e-6, abs=1e-5)
 
 
 @pytest.mark.parametrize(("latitude_deg", "rate"), [(0, [0, 15.041, 0]), (90, [0, 0, 15.041]), (-90, [0, 0, -15.041])])

@@ -5,17 +5,15 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration, ImuCalibration, Start
 from sonar_graph.errors import MeasurementError
 from sonar_graph.estimator import load_estimator
 from sonar_graph.measurements import Dvl, Imu, Measurements
-from sonar_graph.navigation import Preintegrator
-from sonar_graph.navigation.imu_gaps import NO_TURNS, closed_variance, hole_ns, open_variance, turn_psd
-from sonar_graph.navigation.odometry import Odometry, motion_between_nodes, motion_since_node
-from sonar_graph.navigation.preintegration.dvl_gaps import integral, line_before
-from sonar_graph.navigation.preintegration.joint_preintegration import JointPreintegrator
+from sonar_graph.navigation import Odometry
+from sonar_graph.navigation.imu_gaps import Turns, closed_variance, error_in_hole, hole_ns, open_variance
+from sonar_graph.navigation.joint_preintegration import JointPreintegrator
+from sonar_graph.numerics.matrices import Vec3
 from sonar_graph.testing import check_consistent
 
 from . import ways
@@ -113,14 +111,14 @@ def test_without_accelerometer_the_velocity_is_a_random_walk(until_s, share):
 
 
 def test_nothing_changes_where_no_sample_is_missing():
-    """The same bits with and without a model of gaps, between nodes and since one."""
+    """The same bits whatever counts as a gap, between epochs and since one."""
     steady, ns = Vehicle(), stamps(Vehicle.DVL_HZ, 8.0)
-    odometry = Odometry(Calibration(imu=NOISY, dvl=DVL))
-    odometry.add(steady.imu(stamps(Vehicle.IMU_HZ, 8.1)), steady.dvl(ns))
-    bridging = Preintegrator.from_calibration(Calibration(imu=NOISY, dvl=DVL))
-    plain = Preintegrator(bridging.gyro_noise_density, bridging.body_p_dvl)
-    for function, until_s in ((motion_between_nodes, 7.0), (motion_since_node, 1.3)):
-        one, other = (function(odometry, p, at(1.0), at(until_s), np.zeros(3), None) for p in (bridging, plain))
+    rows = steady.imu(stamps(Vehicle.IMU_HZ, 8.1)), steady.dvl(ns)
+    for until_s in (7.0, 1.3):
+        one, other = (
+            motion(*rows, Calibration(imu=NOISY, dvl=DVL.model_copy(update={"gap_s": gap_s})), 1.0, until_s)
+            for gap_s in (1.5, 100.0)
+        )
         assert one.i_T_j.equals(other.i_T_j, 0.0)
         assert np.array_equal(one.covariance, other.covariance)
 
@@ -175,56 +173,36 @@ def test_samples_out_of_order_give_the_same_estimate_as_in_order(name):
     assert found[1].covariance == pytest.approx(found[0].covariance, rel=1e-6, abs=1e-12)
 
 
-ZERO, NODE_S, RATE_HZ, EVEN = (0.0, 0.0, 0.0), 10.0, 20.0, 1e-4 * np.eye(3)
+def at_rest_until(until_s, dvl_hz, count=0, imu_from_s=0.0, noise=0.0, **known):
+    """Over an open gap from 10 s on, of a vehicle at rest with the last samples of a log."""
+    samples_ns = stamps(dvl_hz, 10.0)
+    log = dvl(samples_ns, noise)
+    log = log.rows(slice(len(log) - count, None)) if count else log
+    inertial = imu(stamps(20.0, until_s + 1.0 - imu_from_s, imu_from_s), 0.0)
+    return motion(inertial, log, ways.calibration(**known), 10.0, until_s)
 
 
-def fitted(dvl_hz, velocity=0.0, count=0, imu_rows=None, cov=EVEN):
-    """Line at the last sample of a vehicle at rest."""
-    imu_rows = imu_rows or imu(stamps(RATE_HZ, NODE_S + 1.0), ZERO)
-    samples = dvl(stamps(dvl_hz, NODE_S)[-count:], velocity, cov)
-    inertial = imu_rows.stamps_ns, imu_rows.angular_velocity.copy(), imu_rows.specific_force.copy()
-    columns = (*inertial, samples.stamps_ns, samples.velocity.copy(), samples.velocity_cov.copy(), False, NO_TURNS)
-    return line_before(columns, ZERO, ZERO, len(samples) - 1, ZERO, ZERO)
-
-
-def test_a_line_takes_covered_samples_of_the_last_five_seconds_four_at_least_over_a_second():
-    assert fitted(4.0).sums.n == 21
-    assert fitted(4.0, imu_rows=imu(stamps(RATE_HZ, 4.0, NODE_S - 3.0), ZERO)).sums.n == 13
-    for dvl_hz, count, is_known in ((2.0, 3, False), (2.0, 4, True), (10.0, 8, False), (10.0, 12, True)):
-        assert fitted(dvl_hz, count=count).is_known == is_known
+@pytest.mark.parametrize(
+    ("dvl_hz", "count", "imu_from_s", "is_line"),
+    [
+        *((4.0, 0, 0.0, True), (4.0, 0, 8.0, True), (4.0, 0, 9.4, False)),
+        *((2.0, 3, 0.0, False), (2.0, 4, 0.0, True), (10.0, 8, 0.0, False), (10.0, 12, 0.0, True)),
+    ],
+)
+def test_a_line_needs_four_samples_over_a_second_that_inertial_rows_cover(dvl_hz, count, imu_from_s, is_line):
+    """Else the velocity walks."""
+    found = at_rest_until(17.0, dvl_hz, count, imu_from_s, velocity_walk_density=0.1)
+    walk_m = np.sqrt(0.1**2 * 7.0**3 / 3.0)
+    assert (np.sqrt(found.covariance[3, 3]) < 0.1 * walk_m) == is_line
 
 
 def test_the_displacement_is_that_of_the_fitted_line():
-    """At rest, y is gravity's line; samples off it are fitted by least squares, as numpy does."""
+    """Samples of the last five seconds, off gravity's line, are fitted by least squares, as numpy does."""
     noise = 0.01 * np.random.default_rng(0).standard_normal((41, 3))
-    found, *_ = integral(fitted(4.0, noise), 7.0, 0.0, 0.0)
+    found = at_rest_until(17.0, 4.0, noise=noise, velocity_walk_density=1.0)
     t = -np.arange(20, -1, -1) / 4.0
-    slope, level = np.polyfit(t, noise[-21:] - np.outer(t, [0.0, 0.0, 9.80665]), 1)
-    assert found == pytest.approx(7.0 * level + 7.0**2 / 2 * slope, abs=1e-6)
-
-
-def test_noise_in_the_window_weighs_as_its_integrals_say():
-    """`K` and its integral summed numerically; gyros tilt gravity, level errors apart."""
-    T, n = 7.0, 200_001
-    line = fitted(10.0)
-    W = -2.0 * line.sums.t / line.sums.n
-    s = np.linspace(0.0, 1.0, n)
-    r = T * (T / 2 + W / 2) / W
-    K = T * s - 6 * r * s * (1 - s)
-    by_force = W * np.trapezoid(K**2, s)
-    tilted = np.concatenate([[0.0], np.cumsum((K[1:] + K[:-1]) / 2 * np.diff(s))])
-    by_gyro = 9.80665**2 * W**3 * np.trapezoid(tilted**2, s)
-    quiet, forced, turned = (integral(line, T, *noise)[3] for noise in ((0.0, 0.0), (0.0, 1.0), (1.0, 0.0)))
-    assert np.subtract(forced, quiet) == pytest.approx(by_force * np.eye(3), rel=1e-6)
-    assert np.subtract(turned, quiet) == pytest.approx(by_gyro * np.diag([1.0, 1.0, 0.0]), rel=1e-6)
-
-
-def test_noise_of_a_turning_log_is_turned_to_the_node():
-    turning = imu(stamps(RATE_HZ, NODE_S + 1.0), (0.0, 0.0, 0.3))
-    cov = np.diag([4e-4, 1e-4, 2e-4])
-    found = fitted(4.0, imu_rows=turning, cov=cov).Q
-    R = Rotation.from_rotvec(np.outer(-np.arange(21) / 4.0, [0.0, 0.0, 0.3])).as_matrix()
-    assert np.array(found) == pytest.approx((R @ cov @ R.transpose(0, 2, 1)).sum(axis=0), rel=1e-6, abs=1e-12)
+    slope, level = np.polyfit(t, noise[-21:], 1)
+    assert found.i_T_j.translation() == pytest.approx(7.0 * level + 7.0**2 / 2 * slope, abs=1e-6)
 
 
 MS = 1_000_000
@@ -322,13 +300,13 @@ def test_a_coarse_gyros_rows_beside_a_hole_err_for_all_of_it(until_s, is_modelle
 def test_the_noise_of_rows_goes_by_the_interval_that_is_typical():
     """By hand: density 2, rows 10 ms apart but for one lost, and the third of three steps of an open hole."""
     ns = T0_NS + MS * np.array([0, 10, 20, 30, 50, 60, 70, 80, 90])
-    turns = ((1e-9,) * 3, (1.0,) * 3, 2.0)
+    turns = Turns(True, Vec3(1e-9, 1e-9, 1e-9), Vec3(1.0, 1.0, 1.0), 2.0)
     until_ns = int(ns[-1]) + 300 * MS
-    opened = turn_psd(turns, ns, 9, 9, until_ns - 100 * MS, until_ns)
+    opened = error_in_hole(turns, ns, 9, 9, until_ns - 100 * MS, until_ns)
     assert opened == pytest.approx((4.0 / 0.01 * (0.3**2 - 0.2**2) / 0.1,) * 3)
-    closed = turn_psd(turns, np.append(ns, until_ns), 10, 9, until_ns - 100 * MS, until_ns)
+    closed = error_in_hole(turns, np.append(ns, until_ns), 10, 9, until_ns - 100 * MS, until_ns)
     assert closed == pytest.approx((4.0 / 0.01 * 0.3 / 2,) * 3)
-    alone = turn_psd(turns, ns[:1], 1, 1, int(ns[0]) + 2000 * MS, int(ns[0]) + 2100 * MS)
+    alone = error_in_hole(turns, ns[:1], 1, 1, int(ns[0]) + 2000 * MS, int(ns[0]) + 2100 * MS)
     assert max(alone) < 1e-15
 
 
@@ -376,9 +354,7 @@ def test_forgetting_rows_in_a_hole_changes_nothing():
     for odometry in (whole, forgetful):
         odometry.add(with_hole(2.0, 16.0, 20.0), dvl(stamps(5, 20.0), (0.4, 0.0, 0.0)))
     forgetful.forget_before(at(15.0))
-    assert len(forgetful.columns()[0]) < len(whole.columns()[0])
-    ends, preintegrator = (at(15.0), at(18.0), np.zeros(3), None), Preintegrator.from_calibration(Calibration())
-    one, other = (motion_between_nodes(told, preintegrator, *ends).covariance for told in (whole, forgetful))
+    one, other = (told.motion(at(15.0), at(18.0), np.zeros(3)).covariance for told in (whole, forgetful))
     assert np.array_equal(one, other)
     assert one[2, 2] > 1e-3
 

@@ -11,27 +11,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sonar_graph.calibration import Calibration
-from sonar_graph.errors import CalibrationError, MeasurementError
-from sonar_graph.navigation import Preintegrator
-from sonar_graph.navigation.imu_gaps import NO_TURNS
-from sonar_graph.navigation.preintegration.recursion import Steps, merge_rows
+from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
+from sonar_graph.measurements import Dvl, Imu
+from sonar_graph.navigation import Odometry
 
 from . import ways
-from .rows import NS, T0_NS, at, dead_reckoned, dense_covariance, dvl, imu, part, random_steps, stamps, waves
+from .rows import NS, T0_NS, Steps, at, dead_reckoned, dense_covariance, dvl, imu, stamps, steps_of, waves
 from .ways import WAYS, Way, attitude, blinded, change_of, motion, moved_by, rows, spoilt, velocity_at
 
 every_way = pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
 
-IMU_NS = np.array([0, 10, 20, 32, 40, 50], dtype=np.int64) * 10**7
-DVL_NS = np.array([-5, 20, 36, 52], dtype=np.int64) * 10**7
-RNG = np.random.default_rng(0)
-RATE, FORCE, VELOCITY = RNG.standard_normal((6, 3)), RNG.standard_normal((6, 3)), RNG.standard_normal((4, 3))
-ROOTS = RNG.standard_normal((4, 3, 3))
-COV = ROOTS @ ROOTS.transpose(0, 2, 1)
 LEVER, BIAS = np.array([-0.2, 0.1, -0.15]), np.array([0.01, -0.02, 0.03])
 GYRO_DENSITY = 3e-3
-PREINTEGRATOR = Preintegrator(GYRO_DENSITY, LEVER)
 seeds = st.integers(0, 2**32 - 1)
 
 
@@ -39,49 +30,61 @@ def same_pose(a: gtsam.Pose3, b: gtsam.Pose3, tolerance: float = 1e-10) -> bool:
     return bool(np.abs(gtsam.Pose3.Logmap(a.between(b))).max() < tolerance)
 
 
-def sampled(stamps: np.ndarray, values: np.ndarray, t: np.ndarray, hold_past: bool) -> np.ndarray:
-    if hold_past:
-        return values[np.minimum(np.searchsorted(stamps, t), len(stamps) - 1)]
-    return np.column_stack([np.interp(t, stamps, values[:, axis]) for axis in range(3)])
+def sensors(interpolation: str = "linear", **options) -> Calibration:
+    """Bold enough for any velocity, with a lever arm."""
+    imu = ImuCalibration(gyro_noise_density=GYRO_DENSITY, **options)
+    dvl = DvlCalibration(velocity_walk_density=10.0, mounting=Mounting(translation_m=tuple(LEVER)))
+    return Calibration(imu=imu, dvl=dvl, odometry_interpolation=interpolation)
 
 
-def density(t: float, rows: int, hold_past: bool) -> np.ndarray:
-    """Half of either end's covariance over the interval about t; past the rows that of the last interval."""
-    k = int(np.searchsorted(DVL_NS[:rows], t))
-    last = min(k, rows - 1)
-    if last == 0:
-        return np.zeros((3, 3))
-    interval_s = (DVL_NS[last] - DVL_NS[last - 1]) * 1e-9
-    ends = (last, last) if hold_past or k >= rows else (last, last - 1)
-    return interval_s * (COV[ends[0]] + COV[ends[1]]) / 2
+def brisk(seed: int) -> tuple[Imu, Dvl]:
+    """Stamps in no relation, each sample with its own covariance, none before the first velocity."""
+    rng = np.random.default_rng(seed)
+    quick = stamps(40, 2.5) + rng.integers(-5_000_000, 5_000_000, 101)
+    slow = T0_NS + np.sort(rng.choice(np.arange(20, 2300), 9, replace=False)) * 1_000_000
+    root = 0.01 * rng.standard_normal((9, 3, 3))
+    force = np.array([0.3, -0.2, 9.8]) + waves(quick, seed + 1, 1.0)
+    velocity = np.array([0.5, 0.1, 0.0]) + waves(slow, seed + 2, 0.3)
+    return imu(quick, waves(quick, seed, 0.8), force), dvl(slow, velocity, root @ np.swapaxes(root, 1, 2))
 
 
-@given(st.integers(-8, 60), st.integers(0, 40), st.integers(1, 6), st.integers(1, 4), st.booleans())
-def test_steps_end_at_every_stamp_of_either_sensor_with_each_ones_mean(start, length, imu_rows, dvl_rows, hold_past):
-    start_ns, end_ns = start * 10**7, (start + length) * 10**7
-    known = np.concatenate([IMU_NS[:imu_rows], DVL_NS[:dvl_rows]])
-    edges = np.unique(np.concatenate([[start_ns, end_ns], known[(known > start_ns) & (known < end_ns)]]))
-    middles = (edges[:-1] + np.diff(edges) // 2).astype(float)
-    columns = IMU_NS, RATE, FORCE, DVL_NS, VELOCITY, COV, hold_past, NO_TURNS
-    duration, rate, velocity, psd, force, _ = merge_rows(columns, imu_rows, dvl_rows, start_ns, end_ns)
-    assert duration == pytest.approx(np.diff(edges) * 1e-9)
-    assert rate == pytest.approx(sampled(IMU_NS[:imu_rows], RATE[:imu_rows], middles, hold_past))
-    assert force == pytest.approx(sampled(IMU_NS[:imu_rows], FORCE[:imu_rows], middles, hold_past))
-    assert velocity == pytest.approx(sampled(DVL_NS[:dvl_rows], VELOCITY[:dvl_rows], middles, hold_past))
-    assert psd == pytest.approx(np.array([density(t, dvl_rows, hold_past) for t in middles]).reshape(-1, 3, 3))
+@pytest.mark.parametrize("interpolation", ["linear", "hold-past"])
+@given(seeds, st.lists(st.integers(0, 2400), min_size=3, max_size=3).map(sorted))
+@settings(max_examples=15)
+def test_motions_are_dead_reckoning_and_a_dense_recursion_over_steps_cut_by_hand(interpolation, seed, ends_ms):
+    """From the first velocity on, and from any instant to another by what is known at a third; one by one alike."""
+    (inertial, log), gapless = brisk(seed % 2**31), {"gap_s": 10.0}
+    calibration = sensors(interpolation)
+    odometry = Odometry(calibration.model_copy(update={"dvl": calibration.dvl.model_copy(update=gapless)}))
+    odometry.add(inertial, log)
+    first_ns = int(log.stamps_ns[0])
+    start, end, known = (max(T0_NS + ms * 1_000_000, first_ns) for ms in ends_ms)
+    intervals = np.array([(first_ns, int(log.stamps_ns[-1]), int(inertial.stamps_ns[-1])), (start, end, known)])
+    found = odometry.motions(*intervals.T.copy(), BIAS)
+    for e, (begin_ns, end_ns, known_ns) in enumerate(intervals.tolist()):
+        steps = steps_of(inertial, log, begin_ns, end_ns, known_ns, interpolation == "hold-past")
+        expected, D = dense_covariance(steps, BIAS, LEVER, GYRO_DENSITY)
+        scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected))).max() + 1e-30
+        poses = dead_reckoned(steps, BIAS, LEVER)
+        turned = [
+            p.rotation().matrix() @ exp_mean(dt * (w - BIAS)) @ f * dt
+            for p, dt, w, f in zip(poses, steps.duration_s, steps.rate, steps.force, strict=False)
+        ]
+        assert same_pose(gtsam.Pose3(gtsam.Rot3(found.dR[e]), found.dp[e]), poses[-1])
+        assert np.abs((found.C[e] - expected) / scale).max() < 1e-3
+        assert np.array_equal(found.C[e], found.C[e].T)
+        assert found.D[e] == pytest.approx(D, abs=1e-3 * np.abs(D).max() + 1e-15)
+        assert found.impulse[e] == pytest.approx(np.sum(turned, axis=0) if turned else np.zeros(3), abs=1e-9)
+        one = odometry.motion(begin_ns, end_ns, BIAS, None, known_ns)
+        assert same_pose(one.i_T_j, poses[-1])
+        assert np.allclose(one.covariance, found.C[e], rtol=0, atol=1e-9 * scale)
+        assert np.allclose(one.D_bias, found.D[e], rtol=0, atol=1e-12)
 
 
-@given(seeds)
-@settings(max_examples=20)
-def test_preintegration_equals_dead_reckoning_and_a_dense_recursion(seed):
-    steps = random_steps(seed)
-    found = PREINTEGRATOR.integrate(steps, BIAS)
-    expected, D = dense_covariance(steps, BIAS, LEVER, GYRO_DENSITY)
-    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
-    assert same_pose(found.i_T_j, dead_reckoned(steps, BIAS, LEVER)[-1])
-    assert np.abs((found.covariance - expected) / scale).max() < 1e-5
-    assert np.array_equal(found.covariance, found.covariance.T)
-    assert found.D_bias == pytest.approx(D, abs=1e-5 * np.abs(D).max())
+def exp_mean(phi: np.ndarray) -> np.ndarray:
+    """Mean of Exp(s phi) over s in [0, 1], by quadrature."""
+    nodes, weights = np.polynomial.legendre.leggauss(10)
+    return sum(w / 2 * gtsam.Rot3.Expmap((1 + s) / 2 * phi).matrix() for s, w in zip(nodes, weights, strict=True))
 
 
 def test_a_held_twist_is_the_exact_planar_exponential():
@@ -99,7 +102,7 @@ def displacement_error_m(interpolation: str, dvl_hz: float) -> float:
     """After 4 s of swaying, against steps of 0.5 ms."""
     fine, slow, quick = stamps(2000, 4.0), stamps(dvl_hz, 4.0), stamps(400, 4.0)
     means, n = [0.5 * (w[1:] + w[:-1]) for w in (waves(fine, 1, 0.2), waves(fine, 2, 0.1))], len(fine) - 1
-    exact = Steps(np.full(n, 5e-4), *means, np.zeros((n, 3, 3)), means[0], np.zeros((n, 3)))
+    exact = Steps(np.full(n, 5e-4), *means, np.zeros((n, 3, 3)), means[0])
     truth = dead_reckoned(exact, np.zeros(3), np.zeros(3))[-1]
     known = Calibration(odometry_interpolation=interpolation)
     rows = imu(quick, waves(quick, 1, 0.2)), dvl(slow, waves(slow, 2, 0.1))
@@ -114,36 +117,6 @@ def test_linear_interpolation_is_of_second_order_and_a_hold_of_first():
     assert linear[0] < 0.2 * held[0]
 
 
-def test_mean_force_is_turned_by_the_attitude_in_the_middle_of_a_step():
-    """Gravity in a vehicle that pitches at 0.1 rad/s, in steps of 0.1 s; their first attitudes err by 5 mrad."""
-    n, dt, rate = 20, 0.1, np.array([0.0, 0.1, 0.0])
-    middles = (np.arange(n) + 0.5) * dt
-    force = np.array([gtsam.Rot3.Expmap(rate * t).unrotate(np.array([0.0, 0.0, 9.81])) for t in middles])
-    steps = Steps(np.full(n, dt), np.tile(rate, (n, 1)), np.zeros((n, 3)), np.zeros((n, 3, 3)), force, np.zeros((n, 3)))
-    found = Preintegrator(1e-4, np.zeros(3)).integrate(steps, np.zeros(3))
-    assert found.mean_specific_force == pytest.approx([0.0, 0.0, 9.81], abs=1e-3)
-
-
-@given(seeds)
-@settings(max_examples=10)
-def test_path_of_a_point_goes_through_the_poses_and_ends_with_them(seed):
-    steps, point = random_steps(seed, n=20), np.array([0.3, -0.1, 0.2])
-    at_ends = np.array([pose.transformFrom(point) for pose in dead_reckoned(steps, BIAS, LEVER)])
-    ends_s = np.concatenate([[0.0], np.cumsum(steps.duration_s)])
-    asked_s = np.sort(np.r_[ends_s, (ends_s[1:] + ends_s[:-1]) / 2, 99.0])
-    path = PREINTEGRATOR.path_of(point, steps, BIAS, asked_s)
-    assert np.allclose(path[:-1:2], at_ends, atol=1e-10)
-    assert np.allclose(path[1:-1:2], (at_ends[1:] + at_ends[:-1]) / 2, atol=1e-10)
-    assert np.allclose(path[-1], at_ends[-1], atol=1e-10)
-
-
-def test_no_steps_are_no_motion():
-    still = PREINTEGRATOR.integrate(part(random_steps(0), 0, 0), BIAS)
-    assert same_pose(still.i_T_j, gtsam.Pose3())
-    assert not still.covariance.any()
-    assert np.isnan(still.mean_specific_force).all()
-
-
 @pytest.mark.parametrize("way", [WAYS["linear"], WAYS["rule linear"]], ids=["steps", "rule"])
 def test_an_unmeasured_force_does_not_touch_the_motion(way):
     imu, dvl = rows()
@@ -154,34 +127,13 @@ def test_an_unmeasured_force_does_not_touch_the_motion(way):
     assert np.isfinite(measured.mean_specific_force).all()
 
 
-def integrated(*vectors):
-    return PREINTEGRATOR.integrate(random_steps(1), *vectors)
-
-
-@pytest.mark.parametrize(
-    ("mistake", "error", "message"),
-    [
-        (lambda: Preintegrator(-1e-4, LEVER), CalibrationError, "gyro_noise_density: expected finite numbers of zero"),
-        (lambda: Preintegrator(np.nan, LEVER), CalibrationError, "gyro_noise_density: expected finite"),
-        (lambda: Preintegrator(1e-4, np.zeros(2)), CalibrationError, r"body_p_dvl: expected shape \(3,\), not \(2,\)"),
-        (lambda: PREINTEGRATOR.bridge((), 0, NS, True, BIAS), CalibrationError, "from_calibration"),
-        (lambda: integrated(np.zeros(6)), MeasurementError, r"bias: expected shape \(3,\), not \(6,\)"),
-        (lambda: integrated(np.array([0.0, np.nan, 0.0])), MeasurementError, "bias: expected finite numbers"),
-        (lambda: integrated(BIAS, np.zeros(1)), MeasurementError, r"earth_rate: expected shape \(3,\)"),
-    ],
-)
-def test_mistakes_are_named(mistake, error, message):
-    with pytest.raises(error, match=message):
-        mistake()
-
-
 @every_way
 def test_the_bias_derivative_and_correction_are_those_of_integrating_again(way):
     """To first order; uncorrected, or corrected with the opposite sign, the motion is far off."""
     imu, dvl = rows()
     base, step, change = moved_by(way, imu, dvl), 1e-6, np.array([4e-4, -3e-4, 5e-4])
     J = [change_of(base, moved_by(way, *spoilt(imu, dvl, "rate", -step * axis))) / step for axis in np.eye(3)]
-    assert base.D_bias == pytest.approx(np.transpose(J), rel=1e-3, abs=0.02)
+    assert base.D_bias == pytest.approx(np.transpose(J), rel=1e-3, abs=max(0.02, 1e-3 * np.abs(J).max()))
     again = moved_by(way, imu, dvl, change).i_T_j
     poses = (base.corrected(change), base.i_T_j, base.corrected(-change))
     corrected, uncorrected, opposite = (np.abs(gtsam.Pose3.Logmap(pose.between(again))).max() for pose in poses)
@@ -208,11 +160,10 @@ def test_earths_rotation_is_removed_as_if_it_stood_still(way):
     """Exaggerated twentyfold, and known in the frame of the first node."""
     imu, dvl = rows()
     world_earth = np.array([0.0, 1e-3, 8e-4])
-    turning, at_dvl = (attitude((ns - T0_NS) * 1e-9).inv().apply(world_earth) for ns in (imu.stamps_ns, dvl.stamps_ns))
-    felt = spoilt(*spoilt(imu, dvl, "rate", turning), "velocity", -np.cross(at_dvl, ways.BODY_P_IMU - ways.BODY_P_DVL))
+    felt = spoilt(imu, dvl, "rate", attitude((imu.stamps_ns - T0_NS) * 1e-9).inv().apply(world_earth))
     earth = attitude(np.array([way.start_s])).inv().apply(world_earth)[0]
     still, found, left_in = moved_by(way, imu, dvl), moved_by(way, *felt, earth=earth), moved_by(way, *felt)
-    assert found.i_T_j.equals(still.i_T_j, 4e-3)
+    assert found.i_T_j.equals(still.i_T_j, 8e-3)
     assert found.i_T_j.rotation().equals(still.i_T_j.rotation(), 4e-4)
     assert not left_in.i_T_j.rotation().equals(still.i_T_j.rotation(), 1e-3)
 
@@ -254,9 +205,9 @@ ISOTROPIC = {"velocity_sigma_m_s": (0.01, 0.01, 0.01)}
         (WAYS["held"], "velocity", {}, {}, 0.002),
         # IMU and Doppler log in one place: how noise of single rates acts on the lever between them is left out.
         (WAYS["closed gap"], "rate", ONE_PLACE, {"lever": np.zeros(3)}, 0.02),
-        (WAYS["open gap"], "rate", ONE_PLACE, {"lever": np.zeros(3), "dvl_hz": 10.0}, 0.15),
+        (WAYS["open gap"], "rate", ONE_PLACE, {"lever": np.zeros(3), "dvl_hz": 10.0}, 0.03),
         (WAYS["closed gap"], "force", {}, {}, 0.04),
-        (WAYS["open gap"], "force", {}, {"dvl_hz": 10.0}, 0.06),
+        (WAYS["open gap"], "force", {}, {"dvl_hz": 10.0}, 0.03),
         (WAYS["open gap"], "velocity", ISOTROPIC, {}, 1e-6),
         (WAYS["open walk"], "velocity", ISOTROPIC, {}, 0.15),
         (Way(5.0, 12.0), "velocity", {}, {}, 0.02),  # what the gap's ends share with their neighbours included
@@ -314,4 +265,4 @@ def test_an_unknown_accelerometer_bias_spreads_as_moving_all_forces_does(name):
     (imu, dvl), way, step = rows(), WAYS[name], 1e-4
     base = moved_by(way, imu, dvl, known={"imu": {"accel_bias_sigma": 0.02}})
     J = [change_of(base, moved_by(way, *spoilt(imu, dvl, "force", step * a)))[3:] / step for a in np.eye(3)]
-    assert base.covariance[3:, 3:] == pytest.approx(0.02**2 * np.transpose(J) @ J, rel=1e-3, abs=1e-8)
+    assert base.covariance[3:, 3:] == pytest.approx(0.02**2 * np.transpose(J) @ J, rel=2e-3, abs=1e-8)

@@ -60,44 +60,6 @@ def test_the_row_at_or_before_a_stamp_is_kept_and_those_after():
         assert len(rows.values[0]) == len(rows.values[1]) == len(rows.stamps_ns)
 
 
-def test_nodes_are_after_one_instant_and_covered_by_the_other_sensor_until_another():
-    imu_ns, dvl_ns = np.array([0, 10, 20]), np.array([-5, 0, 7, 10, 15, 20, 25])
-    ends = ((-5, 9), (-6, 10), (7, 19), (7, 99), (15, 10), (-6, -1))
-    nodes = [(1, 2), (0, 4), (3, 4), (3, 6), (5, 5), (0, 0)]
-    assert [samples.node_range(imu_ns, dvl_ns, *between) for between in ends] == nodes
-
-
-@given(
-    st.lists(st.integers(0, 60), min_size=1, unique=True).map(sorted),
-    st.tuples(st.integers(0, 12), st.integers(0, 12)).map(sorted),
-    st.integers(1, 20),
-)
-def test_gaps_are_between_successive_rows_from_one_to_another_that_are_too_far_apart(stamps, ends, longest):
-    start, end = (min(row, len(stamps) - 1) for row in ends)
-    expected = [row for row in range(start, end) if stamps[row + 1] - stamps[row] > longest]
-    assert samples.rows_before_gaps(np.array(stamps), stamps[start], stamps[end], longest).tolist() == expected
-
-
-STAMPS = np.array([0, 10, 14, 30, 31], dtype=np.int64)
-VALUES = np.random.default_rng(0).standard_normal((5, 3))
-
-
-@given(st.integers(-5, 40), st.integers(1, 5))
-def test_values_are_linear_between_rows_that_are_used_or_held_until_the_next_and_constant_beyond(t, known):
-    """Of all rows; and of the first as if there were no others."""
-    assert samples.rows_until(STAMPS, t) == np.count_nonzero(t >= STAMPS)
-    assert samples.rows_until(STAMPS[:0], t) == 0
-    i = samples.rows_until(STAMPS, t - 1)
-    stamps, values = STAMPS[:known], VALUES[:known]
-    linear = [np.interp(t, stamps, values[:, axis]) for axis in range(3)]
-    held = values[min(int(np.searchsorted(stamps, t)), known - 1)]
-    for hold_past, expected in ((False, linear), (True, held)):
-        assert samples.value_among(STAMPS, VALUES, known, i, t, hold_past) == pytest.approx(expected)
-        assert samples.value_at(stamps, values, samples.rows_until(stamps, t - 1), t, hold_past) == pytest.approx(
-            expected
-        )
-
-
 AT = np.array([10, 20, 30, 40, 50]) * 1_000_000_000
 """Five stamps, ten seconds apart."""
 NUMBER, NUMBERS = "sigma: expected 1 number, not", "sigma: expected 3 numbers, not"
@@ -238,7 +200,7 @@ def test_what_is_refused_does_not_depend_on_how_rows_are_cut(cuts):
     whole, pieces = odometry_at_rest(rows), odometry_at_rest(*(rows.between(*ends) for ends in pairwise(edges)))
     assert told(whole) == [(k, Refusal.OUTLIER) for k in outliers]
     assert sorted(pieces.refused) == sorted(whole.refused)
-    for one, other in zip(pieces.columns()[:6], whole.columns()[:6], strict=True):
+    for one, other in zip(pieces._rows()[:6], whole._rows()[:6], strict=True):
         np.testing.assert_array_equal(one, other)
 
 
@@ -256,7 +218,7 @@ def test_rows_of_few_beams_are_named_until_they_are_completed():
     odometry.add(None, rows.rows(slice(9, None)))
     assert told(odometry) == [(k, Refusal.INCOMPLETE) for k in (0, 1, 28, 29, 30)]
     assert np.isnan([row.distance for row in odometry.refused]).all()
-    np.testing.assert_array_equal(odometry.columns()[3], rows.stamps_ns[2:28])
+    np.testing.assert_array_equal(odometry._rows()[3], rows.stamps_ns[2:28])
 
 
 @pytest.mark.parametrize("more_ns", [0, 1])
@@ -265,7 +227,7 @@ def test_rows_of_few_beams_over_too_long_a_stretch_are_named(more_ns):
     odometry = Odometry(Calibration())
     odometry.add(imu(ns[[0, 2]], 0.0), dvl(ns, 0.8, np.array([WHOLE, BLIND, WHOLE])))
     assert [(row.stamp_ns, row.reason) for row in odometry.refused] == [(T0_NS + NS, Refusal.INCOMPLETE)] * more_ns
-    assert len(odometry.columns()[3]) == 3 - more_ns
+    assert len(odometry._rows()[3]) == 3 - more_ns
 
 
 @pytest.mark.parametrize(
@@ -277,7 +239,7 @@ def test_a_row_of_few_beams_waits_to_be_completed_and_for_no_other(partial, bloc
     rows = driven(partial=(partial,))
     odometry = odometry_at_rest(*(rows.rows(np.array(block)) for block in blocks))
     assert told(odometry) == [(partial, Refusal.INCOMPLETE)]
-    np.testing.assert_array_equal(odometry.columns()[3], rows.stamps_ns[used])
+    np.testing.assert_array_equal(odometry._rows()[3], rows.stamps_ns[used])
 
 
 def test_rows_are_late_up_to_the_settled_stamp_and_those_known_already_are_no_news():
@@ -288,12 +250,12 @@ def test_rows_are_late_up_to_the_settled_stamp_and_those_known_already_are_no_ne
     odometry.add(None, rows)
     odometry.add(None, rows.rows(slice(5, 6)))
     assert told(odometry) == [(4, Refusal.LATE)]
-    assert odometry.columns()[3][-1] == rows.stamps_ns[-1]
+    assert odometry._rows()[3][-1] == rows.stamps_ns[-1]
     odometry = Odometry(Calibration())
     odometry.settle(T0_NS)
     odometry.add(None, dvl(T0_NS + np.array([-1, 0, 1, 2]), [0.8, 0.0, 0.0]))
     assert [row.stamp_ns - T0_NS for row in odometry.refused] == [-1, 0]
-    assert (odometry.columns()[3] - T0_NS).tolist() == [1, 2]
+    assert (odometry._rows()[3] - T0_NS).tolist() == [1, 2]
 
 
 def test_of_equal_stamps_the_first_counts():
@@ -302,8 +264,8 @@ def test_of_equal_stamps_the_first_counts():
     across, inside = odometry_at_rest(one), odometry_at_rest(within)
     assert across.add(None, other)
     for odometry in (across, inside):
-        np.testing.assert_array_equal(odometry.columns()[3], one.stamps_ns)
-        np.testing.assert_array_equal(odometry.columns()[4], one.velocity)
+        np.testing.assert_array_equal(odometry._rows()[3], one.stamps_ns)
+        np.testing.assert_array_equal(odometry._rows()[4], one.velocity)
 
 
 @pytest.mark.parametrize(
@@ -312,7 +274,7 @@ def test_of_equal_stamps_the_first_counts():
 def test_repeats_are_left_out_wherever_they_are_in_a_block(offsets, kept):
     odometry = Odometry(Calibration())
     odometry.add(imu(T0_NS + np.array(offsets), 0.0), None)
-    assert (odometry.columns()[0] - T0_NS).tolist() == kept
+    assert (odometry._rows()[0] - T0_NS).tolist() == kept
 
 
 def test_only_rows_before_others_ask_for_motion_anew():
@@ -345,7 +307,7 @@ def test_held_velocities_may_jump():
 def test_an_infinite_variance_is_completed_like_one_of_a_direction_not_measured():
     turned = Calibration(dvl=DvlCalibration(mounting=Mounting(rpy_rad=(0.1, 0.2, 0.7))))
     logs = [driven((4, 5), blind=np.diag([SIGMA**2, unmeasured, unmeasured])) for unmeasured in (100.0**2, np.inf)]
-    one, other = (odometry_at_rest(rows, calibration=turned).columns()[:6] for rows in logs)
+    one, other = (odometry_at_rest(rows, calibration=turned)._rows()[:6] for rows in logs)
     for column, same in zip(one, other, strict=True):
         np.testing.assert_array_equal(column, same)
     assert len(one[3]) == len(logs[0])

@@ -11,10 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.measurements import Dvl, Imu
-from sonar_graph.navigation import PreintegratedMotion, Preintegrator
-from sonar_graph.navigation.odometry import Odometry, motion_between_nodes, motion_since_node
-from sonar_graph.navigation.preintegration.joint_preintegration import JointPreintegrator
-from sonar_graph.navigation.preintegration.joint_recursion import RULES
+from sonar_graph.navigation import Odometry, PreintegratedMotion
+from sonar_graph.navigation.joint_preintegration import RULES, JointPreintegrator
 
 from .rows import T0_NS, at, dvl, stamps
 
@@ -172,8 +170,11 @@ class Vehicle:
 
 
 def motion(imu, dvl, known, start_s, until_s, bias=(0.0, 0.0, 0.0), earth=None):
-    """From a node; to a node by the final motion, to anywhere else by the provisional one, which sees no later row."""
-    odometry, preintegrator = Odometry(known), Preintegrator.from_calibration(known)
+    """From an epoch; to an epoch by the final motion, to anywhere else by the provisional one, which sees no later row.
+
+    ``earth``: its rotation in the first frame, of any size.
+    """
+    odometry = Odometry(known)
     odometry.add(imu, dvl)
-    function = motion_between_nodes if at(until_s) in dvl.stamps_ns else motion_since_node
-    return function(odometry, preintegrator, at(start_s), at(until_s), np.array(bias), earth)
+    odometry._earth = earth
+    return odometry.motion(at(start_s), at(until_s), np.array(bias), np.eye(3))

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from sonar_graph.calibration import Calibration, PlanarMotion, Start
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Dvl, Imu
-from sonar_graph.navigation.preintegration.joint_preintegration import JointMotion, JointPreintegrator
+from sonar_graph.navigation.joint_preintegration import JointMotion, JointPreintegrator
 from sonar_graph.slam.models import factors
 from sonar_graph.slam.models.inertial_factors import doppler_odometry, inertial_doppler_odometry
 from sonar_graph.slam.models.sonar_model import range_azimuth

@@ -5,7 +5,7 @@ from sonar_graph.navigation.alignment.allan import longest_rest, noise_densities
 from sonar_graph.navigation.alignment.at_rest import InitialTilt, align_at_rest
 from sonar_graph.navigation.alignment.dvl_imu import DvlMatch, Estimates3D, match_dvl_to_imu
 from sonar_graph.navigation.alignment.gravity import (
-    earth_rate_in_world, gravity_direction, tilt_sigma, up_direction, velocity_at_imu,
+    earth_rate_in_world, gravity_direction, tilt_sigma, up_direction,
 )
 from sonar_graph.navigation.alignment.in_motion import LONGEST_S, align_in_motion, until_hole
 from sonar_graph.navigation.alignment.reference_offset import match_reference_to_imu
@@ -14,5 +14,5 @@ from sonar_graph.navigation.alignment.time_offset import Estimate1D
 __all__ = [
     "DvlMatch", "Estimate1D", "Estimates3D", "InitialTilt", "LONGEST_S", "align_at_rest", "align_in_motion",
     "earth_rate_in_world", "gravity_direction", "longest_rest", "match_dvl_to_imu", "match_reference_to_imu",
-    "noise_densities", "tilt_sigma", "until_hole", "up_direction", "velocity_at_imu",
+    "noise_densities", "tilt_sigma", "until_hole", "up_direction",
 ]

@@ -29,11 +29,6 @@ LEAST_GYRO_NOISE_DENSITY = 1e-7
 """rad/s/√Hz, ten times below the best fibre gyros: keeps tau finite for a gyro without noise."""
 
 
-def velocity_at_imu(velocity: Floats, rate: Floats, body_p_dvl: Floats, body_p_imu: Floats) -> Floats:
-    """Velocity of the IMU's point from that of the DVL's: ``v + w x (p_imu - p_dvl)``, body axes, shape (3,), m/s."""
-    return np.asarray(velocity + np.cross(rate, body_p_imu - body_p_dvl))
-
-
 def gravity_direction(
     motion: PreintegratedMotion,
     velocity_i: Floats,
@@ -49,7 +44,7 @@ def gravity_direction(
     motion
         From epoch i to epoch j, with the mean specific force.
     velocity_i, velocity_j
-        Velocity of the IMU's point in body axes at the two epochs (see `velocity_at_imu`), shape (3,), m/s.
+        Velocity of the IMU's point in body axes at the two epochs, shape (3,), m/s.
     velocity_sigma_m_s
         Standard deviation of one component of either velocity.
 

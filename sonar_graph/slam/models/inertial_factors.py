@@ -29,9 +29,8 @@ from numpy.typing import NDArray
 
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Floats
-from sonar_graph.navigation import finite_vector
-from sonar_graph.navigation.preintegration import DISPLACEMENT, ROTATION, JointMotion
-from sonar_graph.numerics import compiled, left_jacobian, rotation_exp, skew
+from sonar_graph.navigation import DISPLACEMENT, ROTATION, JointMotion, finite_vector
+from sonar_graph.numerics import compiled, cross_matrix, left_jacobian, rotation_exp
 from sonar_graph.slam.models.factors import gaussian
 
 BIAS_ORDER = np.r_[3:6, 0:3]
@@ -65,7 +64,7 @@ def inertial_doppler_odometry(
     Parameters
     ----------
     motion
-        Of `sonar_graph.navigation.preintegration.joint_preintegration`; in a chain, ``motion.after(the one before)``.
+        Of `sonar_graph.navigation.joint_preintegration`; in a chain, ``motion.after(the one before)``.
     gravity
         In the world, shape (3,), m/s²; (0, 0, -9.81) where z is up.
     scale, mounting
@@ -182,7 +181,7 @@ def joint_error(
     H[:3, 0:3] = -by_log @ np.ascontiguousarray(turn.T)
     H[:3, 9:12] = by_log
     by_parameters[:3] = -by_log @ np.ascontiguousarray(E.T) @ left_jacobian(-correction[:3]) @ D[:3]
-    H[3:6, 0:3], H[3:6, 6:9], H[3:6, 15:18] = skew(gained), -world_R_i, world_R_i
+    H[3:6, 0:3], H[3:6, 6:9], H[3:6, 15:18] = cross_matrix(gained), -world_R_i, world_R_i
     _put_point_rows(H[6:9], between + turn @ body_p_imu - fallen, turn, body_p_imu)
     H[6:9, 6:9] = -world_R_i * t
     _put_point_rows(H[9:], between + turn @ body_p_dvl, turn, body_p_dvl)
@@ -193,8 +192,8 @@ def joint_error(
 @compiled
 def _put_point_rows(rows: Floats, seen: Floats, turn: Floats, body_p: Floats) -> None:
     """Derivatives of where a point of body j is, seen from body i, by both poses."""
-    rows[:, 0:3], rows[:, 3:6] = skew(seen), -np.eye(3)
-    rows[:, 9:12], rows[:, 12:15] = -turn @ skew(body_p), turn
+    rows[:, 0:3], rows[:, 3:6] = cross_matrix(seen), -np.eye(3)
+    rows[:, 9:12], rows[:, 12:15] = -turn @ cross_matrix(body_p), turn
 
 
 @compiled

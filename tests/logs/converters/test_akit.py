@@ -7,8 +7,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from sonar_graph.calibration import Mounting
 from sonar_graph.logs.convert.akit import earth_centred, east_north_up, enu_R_flu, read_akit
-from sonar_graph.navigation import Preintegrator
-from sonar_graph.navigation.odometry import Odometry, motion_between_nodes
+from sonar_graph.navigation import Odometry
 
 LATITUDE = 0.5733
 EARTH_RATE_RAD_S = 7.292115e-5
@@ -119,17 +118,15 @@ WAITING = 2
 
 def lost_in_gaps(sequence, calibration, gap_s=30):
     """Root mean square of what motion over a gap differs by from that over all samples, m."""
-    preintegrator, lost, dvl = Preintegrator.from_calibration(calibration), [], sequence.dvl
+    lost, dvl = [], sequence.dvl
     attitude = Slerp(sequence.truth.stamps_ns, sequence.truth.rotations())
-    latitude = calibration.earth_rate_latitude_rad
-    world_earth = EARTH_RATE_RAD_S * np.array([0.0, np.cos(latitude), np.sin(latitude)])
     for first in range(20, 340, 20):
         ends = [int(dvl.stamps_ns[k]) for k in (first, first + gap_s)]
-        earth, displacements = attitude(ends[0]).inv().apply(world_earth), []
+        displacements = []
         for kept in (slice(None), np.r_[: first + 1, first + gap_s - WAITING : len(dvl)]):
             odometry, rows = Odometry(calibration), dvl.rows(kept)
             odometry.add(sequence.imu, rows)
-            displacements.append(motion_between_nodes(odometry, preintegrator, *ends, np.zeros(3), earth).i_T_j)
+            displacements.append(odometry.motion(*ends, np.zeros(3), attitude(ends[0]).as_matrix()).i_T_j)
         lost.append(displacements[0].translation() - displacements[1].translation())
     return np.sqrt(np.mean(np.sum(np.square(lost), axis=1)))
 

@@ -19,42 +19,59 @@ import numpy as np
 
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.motion import Motions
-from sonar_graph.navigation.preintegration.steps import Steps, put
-from sonar_graph.numerics.jit import compiled
-from sonar_graph.numerics.matrices import (
+from sonar_graph.navigation.steps import Rows, has_gap, put, rows_until, step_from
+from sonar_graph.numerics import (
     I3,
     O3,
     ZERO,
     Mat6,
+    Vec3,
+    compiled,
     cross,
     diagonal,
     exp_and_mean,
     inverse_adjoint,
-    mat,
     skew,
     store,
     store6,
     vec,
 )
 
+NOWHERE = Vec3(np.nan, np.nan, np.nan)
+
 
 @compiled
 def motions_over(
-    first: Ints, steps: Steps, bias: Floats, earth: Floats, body_p_dvl: Floats, gyro_density: float
+    rows: Rows,
+    start_ns: Ints,
+    end_ns: Ints,
+    known_ns: Ints,
+    longest_ns: int,
+    bias: Floats,
+    earth: Floats,
+    body_p_dvl: Floats,
+    gyro_density: float,
 ) -> Motions:
-    """Motions over intervals, each of steps ``first[e]`` to ``first[e + 1]``.
+    """Motions over intervals, each from rows stamped no later than its ``known_ns``.
 
-    Removed are the gyro bias (body frame) and the Earth's rotation (frame i), rad/s.
+    Removed are the gyro bias (body frame) and the Earth's rotation (frame i), rad/s. An interval with more than
+    ``longest_ns`` between Doppler samples is all NaN.
     """
-    n, b, E, arm = len(first) - 1, vec(bias), vec(earth), vec(body_p_dvl)
+    n, b, E, arm = len(start_ns), vec(bias), vec(earth), vec(body_p_dvl)
     dR, dp, impulse = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3))
     C, D = np.empty((n, 6, 6)), np.empty((n, 6, 3))
-    N = gyro_density**2 * I3
     for e in range(n):
+        t, end = start_ns[e], end_ns[e]
+        i, k = rows_until(rows.imu_ns, t), rows_until(rows.dvl_ns, t)
+        imu_rows, dvl_rows = rows_until(rows.imu_ns, known_ns[e]), rows_until(rows.dvl_ns, known_ns[e])
         R, p, f, tt, rt, rr, D_t, D_r = I3, ZERO, ZERO, O3, O3, O3, O3, O3
-        for k in range(first[e], first[e + 1]):
-            dt, w, v = steps.duration_s[k], vec(steps.rate[k]) - b - R.T @ E, vec(steps.velocity[k])
-            N_g, Q = N + diagonal(vec(steps.turn_psd[k])), mat(steps.velocity_psd[k])
+        if has_gap(rows.dvl_ns, dvl_rows, k, t, end, longest_ns):
+            t, R, p, f = end, np.nan * I3, NOWHERE, NOWHERE
+        while t < end:
+            t, dt, rate, v, Q, force, turn_psd = step_from(rows, imu_rows, dvl_rows, i, k, t, end)
+            i += int(i < imu_rows and rows.imu_ns[i] <= t)
+            k += int(k < dvl_rows and rows.dvl_ns[k] <= t)
+            w, N_g = rate - b - R.T @ E, gyro_density**2 * I3 + diagonal(turn_psd)
             turn, mean = exp_and_mean(dt * w)
             R_k = R @ mean
             s = dt * (R_k @ (v - cross(w, arm)))
@@ -64,15 +81,14 @@ def motions_over(
             rt += dt * (MN @ R_k.T)
             rr += dt * (MN @ M.T + R_k @ Q @ R_k.T)
             D_t, D_r = D_t - dt * R_k, D_r - dt * M
-            f += dt * (R_k @ vec(steps.force[k]))
+            f += dt * (R_k @ force)
             p, R = p + s, R @ turn
         to_j = inverse_adjoint(R, p)
-        C_i = Mat6(tt, rt.T, rt, rr)
         D_j = to_j @ Mat6(D_t, O3, D_r, O3)
         store(R, dR[e], 0, 0)
         put(p, dp, e)
         put(f, impulse, e)
-        store6(to_j @ C_i @ to_j.T, C[e])
+        store6(to_j @ Mat6(tt, rt.T, rt, rr) @ to_j.T, C[e])
         store(D_j.a, D[e], 0, 0)
         store(D_j.c, D[e], 3, 0)
     return Motions(dR, dp, C, D, impulse)

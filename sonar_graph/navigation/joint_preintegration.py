@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from math import isfinite
+from typing import Literal, NamedTuple
 
 import gtsam
 import numpy as np
@@ -25,9 +26,8 @@ from sonar_graph.calibration import SHORTEST_HOLE_S, Calibration
 from sonar_graph.errors import CalibrationError, MeasurementError
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints
 from sonar_graph.motion import PreintegratedMotion
-from sonar_graph.navigation.imu_gaps import row_after_hole
-from sonar_graph.navigation.preintegration.joint_recursion import LONG_S, RULES, DopplerRule, Inertial, preintegrate
-from sonar_graph.navigation.preintegration.preintegrator import float_triple
+from sonar_graph.navigation.imu_gaps import UNTURNED, row_after_hole
+from sonar_graph.navigation.inertial import Line, hat, spread, sums_along
 from sonar_graph.navigation.samples import (
     finite_vector,
     is_partial,
@@ -38,6 +38,32 @@ from sonar_graph.navigation.samples import (
     require_noise,
     require_order,
 )
+from sonar_graph.navigation.steps import Rows
+
+DopplerRule = Literal["inertial", "linear", "hold-previous", "zoh-previous", "zoh-current", "trapezoid"]
+
+
+class Rule(NamedTuple):
+    """Velocity between two Doppler samples where the accelerometer does not shape it."""
+
+    shares: tuple[float, float]
+    """The later sample's share at the beginning of the interval and at its end."""
+    turned_at: float | None = None
+    """Rotation that turns the velocity, as a share of the interval; None: that of every step."""
+
+
+RULES: dict[DopplerRule, Rule | None] = {
+    "inertial": None,
+    "linear": Rule((0.0, 1.0)),
+    "hold-previous": Rule((0.0, 0.0)),
+    "zoh-previous": Rule((0.0, 0.0), turned_at=0.5),
+    "zoh-current": Rule((1.0, 1.0), turned_at=1.0),
+    "trapezoid": Rule((0.5, 0.5), turned_at=0.5),
+}
+"""Others than "inertial" and "linear" are those of other projects, for comparison (docs/theory/preintegration.md)."""
+LONG_S = 0.4
+"""Interval of Doppler samples above which the rule "inertial" takes the log's way about the IMU's point from the
+gyros."""
 
 
 def refuse_beyond(longest_s: float, dvl_ns: Ints) -> None:
@@ -103,8 +129,8 @@ class JointMotion:
     >>> sensors = JointPreintegrator(gyro_noise_density=1e-4, accel_noise_density=1e-3)
     >>> first = sensors.integrate(imu, dvl, 0, 1_000_000_000)
     >>> second = sensors.integrate(imu, dvl, 1_000_000_000, 2_000_000_000).after(first)
-    >>> second.relative_pose().i_T_j.translation().round(6).tolist()
-    [0.5, 0.0, 0.0]
+    >>> round(float(second.relative_pose().i_T_j.x()), 6)
+    0.5
     """
 
     i_R_j: gtsam.Rot3
@@ -228,8 +254,8 @@ class JointPreintegrator:
     >>> dvl = Dvl(dvl_ns, np.tile([0.5, 0.0, 0.0], (6, 1)), np.full((6, 3, 3), np.nan))
     >>> sensors = JointPreintegrator(gyro_noise_density=1e-4, accel_noise_density=1e-3)
     >>> motion = sensors.integrate(imu, dvl, 0, 1_000_000_000)
-    >>> motion.displacement.round(6).tolist(), motion.covariance.shape
-    ([0.5, 0.0, 0.0], (12, 12))
+    >>> round(float(motion.displacement[0]), 6), motion.covariance.shape
+    (0.5, (12, 12))
     """
 
     gyro_noise_density: float
@@ -241,7 +267,7 @@ class JointPreintegrator:
     body_T_imu: gtsam.Pose3 = field(default_factory=gtsam.Pose3)
     body_T_dvl: gtsam.Pose3 = field(default_factory=gtsam.Pose3)
     rule: DopplerRule = "inertial"
-    """Velocity between samples: see `sonar_graph.navigation.preintegration.joint_recursion`."""
+    """Velocity between samples: a name of `RULES`."""
     longest_s: float = 1.5
     """Longest interval between Doppler samples, for all rules but "inertial"."""
     longest_hole_s: float = SHORTEST_HOLE_S
@@ -329,18 +355,18 @@ class JointPreintegrator:
         force = inertial.specific_force @ body_R_imu.T
         if self.rule == "inertial" and not np.isfinite(force).all():
             raise MeasurementError('Imu.specific_force: not measured in every row; use the rule "linear"')
-        rows = Inertial(
+        rows = Rows(
             inertial.stamps_ns,
             inertial.angular_velocity @ body_R_imu.T,
-            force,
-            float_triple(bias[:3]),
-            float_triple(bias[3:]),
-            float_triple(earth),
-            float_triple(arm),
-            self.gyro_noise_density**2,
-            self.accel_noise_density**2,
+            force - bias[3:],
+            samples.stamps_ns,
+            velocity,
+            cov,
+            False,
+            UNTURNED,
         )
-        R, (v, p, s), P, D, first, last = preintegrate(rows, samples.stamps_ns, velocity, cov, RULES[self.rule])
+        with np.errstate(over="ignore", invalid="ignore"):
+            R, (v, p, s), P, D, first, last = self._integrated(rows, bias[:3], earth, arm)
         if not isfinite(sum(s.tolist()) + P.item(9, 9) + P.item(10, 10) + P.item(11, 11)):
             raise MeasurementError(
                 f"from {start_ns} to {end_ns} ns: the motion is not finite; expected angular velocities in rad/s and"
@@ -348,6 +374,57 @@ class JointPreintegrator:
             )
         ends, span = (cov[0], cov[-1]), (int(start_ns), int(end_ns))
         return JointMotion(gtsam.Rot3(R), v, p, s, P, D, (first, last), ends, np.zeros((3, 3)), bias, *span, *arms)
+
+    def _integrated(
+        self, rows: Rows, bias: Floats, earth: Floats, arm: Floats
+    ) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
+        """R, sums (v, p, s), covariance without the end samples, derivatives, and weights of both end samples."""
+        rule, at_ns, z, n = RULES[self.rule], rows.dvl_ns, rows.velocity, len(rows.dvl_ns) - 1
+        spans_s, T, cuts_ns = np.diff(at_ns) * 1e-9, (at_ns[-1] - at_ns[0]) * 1e-9, at_ns
+        W, jumps, velocity, by_rate_s = np.zeros(n), np.zeros((n + 1, 3)), np.zeros((2, n, 3)), np.zeros(n + 1)
+        if rule is None:
+            past_s, next_s = np.append(0.0, spans_s), np.append(spans_s, 0.0)
+            w, is_long = 0.5 * (past_s + next_s), (past_s > LONG_S, next_s > LONG_S)
+            W, jumps = np.cumsum(w)[:-1], w[:, None] * z
+            if is_long[0].any():
+                by_rate_s = 0.5 * (past_s * is_long[0] + next_s * is_long[1])
+                rate = np.column_stack([np.interp(at_ns, rows.imu_ns, column) for column in rows.rate.T]) - bias
+                jumps += np.subtract(*is_long, dtype=float)[:, None] * arm - by_rate_s[:, None] * np.cross(rate, arm)
+        else:
+            velocity = np.array([z[:-1] + share * np.diff(z, axis=0) for share in rule.shares])
+        if rule is not None and rule.turned_at is not None:
+            turned_ns = at_ns[:-1] + np.floor(rule.turned_at * np.diff(at_ns)).astype(np.int64)
+            cuts_ns = np.unique(np.append(at_ns, turned_ns))
+            turned = np.searchsorted(cuts_ns, turned_ns)
+            jumps = np.zeros((len(cuts_ns), 3))
+            jumps[turned] = spans_s[:, None] * velocity[0]
+            W, velocity = np.zeros(len(cuts_ns) - 1), np.zeros((2, len(cuts_ns) - 1, 3))
+        line = Line(cuts_ns, rule is None, W, jumps, velocity, int(at_ns[0]))
+        sums = sums_along(rows, len(rows.imu_ns), line, np.eye(3), bias, earth)
+        errors = spread(sums, sums.whole, T, self.gyro_noise_density, self.accel_noise_density)
+        R = sums.R[-1]
+        if rule is None:
+            weights = w[:, None, None] * sums.R
+            swung_s = np.tensordot(by_rate_s, sums.R, 1)
+            sums.whole[6:] += np.cross(earth, swung_s @ arm)
+            errors.D_gyro[6:] -= swung_s @ hat(arm)
+        else:
+            if rule.turned_at is None:
+                whole, rising = sums.turned_s.sum(axis=0), sums.turned_s[1]
+            else:
+                whole = rising = spans_s[:, None, None] * sums.R[turned]
+            later = rule.shares[0] * whole + (rule.shares[1] - rule.shares[0]) * rising
+            none = np.zeros((1, 3, 3))
+            weights = np.concatenate([whole - later, none]) + np.concatenate([none, later])
+        P, D = np.empty((12, 12)), np.zeros((12, 10))
+        P[:3, :3], P[3:, :3], P[3:, 3:] = self.gyro_noise_density**2 * T * np.eye(3), errors.C_theta @ R, errors.C
+        P[:3, 3:] = P[3:, :3].T
+        inner = weights[1:-1]
+        P[9:, 9:] += np.sum(inner @ rows.cov[1:-1] @ inner.transpose(0, 2, 1), axis=0)
+        D[:3, GYRO], D[3:, GYRO], D[3:, ACCEL] = -R.T @ sums.R_after, errors.D_gyro, errors.D_accel
+        D[9:, 6] = np.einsum("kij,kj->i", weights, z)
+        D[9:, MOUNTING] = -np.sum(weights @ hat(z), axis=0)
+        return R, sums.whole.reshape(3, 3), P, D, weights[0], weights[-1]
 
 
 def doppler_rows_between(dvl: Dvl, start_ns: int, end_ns: int) -> Dvl:

@@ -1,0 +1,127 @@
+"""Rows of gyros, accelerometers and Doppler log, merged into steps of constant rate, velocity and specific force.
+
+An interval is cut at every stamp of either sensor; each step has the mean of both over its length. ``linear``: the
+value in the middle of the step, linear between samples, held past the last known one. ``hold-past``: the sample that
+ends the interval. Doppler noise is white in time: between samples T apart with covariances R_1, R_2 its spectral
+density is ``Q = T (R_1 + R_2) / 2``. docs/theory/preintegration.md.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sonar_graph.measurements import Floats, Ints
+from sonar_graph.navigation.imu_gaps import UNFELT_NS, Turns, error_in_hole, hole_ns
+from sonar_graph.numerics import ZERO, Mat3, Vec3, inlined, mat, vec
+
+
+class Rows(NamedTuple):
+    """Rows of both sensors, body axes, each in the order of their stamps."""
+
+    imu_ns: Ints
+    rate: Floats
+    """Shape (n, 3), rad/s."""
+    force: Floats
+    """Specific force, shape (n, 3), m/s²; NaN where not measured."""
+    dvl_ns: Ints
+    velocity: Floats
+    """Velocity of the DVL's origin, shape (n, 3), m/s."""
+    cov: Floats
+    """Its covariance, shape (n, 3, 3), m²/s²."""
+    hold_past: bool
+    """True where a sample is the mean over the interval that ends at its stamp; else linear."""
+    turns: Turns
+    """Model of the turn in holes of the IMU."""
+
+
+class Step(NamedTuple):
+    """Motion between two successive stamps, as measured: no bias is removed."""
+
+    until_ns: int
+    duration_s: float
+    rate: Vec3
+    """rad/s."""
+    velocity: Vec3
+    """Of the DVL's origin, body axes, m/s."""
+    Q: Mat3
+    """Spectral density of its noise, m²/s."""
+    force: Vec3
+    """Specific force at the IMU, m/s²; NaN where not measured."""
+    turn_psd: Vec3
+    """Spectral density of what the rates miss in holes of the IMU, rad²/s; zero elsewhere."""
+
+
+@inlined
+def rows_until(stamps: Ints, instant_ns: int) -> int:
+    """Number of rows stamped at or before an instant (numpy's search with a side is slow to compile)."""
+    low, high = 0, len(stamps)
+    while low < high:
+        middle = (low + high) // 2
+        if stamps[middle] <= instant_ns:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@inlined
+def value_at(stamps: Ints, values: Floats, n: int, i: int, t: int, hold_past: bool) -> Vec3:
+    """Value at t from the first n rows, where ``stamps[i - 1] < t <= stamps[i]``; outside them the nearest row's."""
+    if i >= n:
+        return vec(values[n - 1])
+    if hold_past or i == 0:
+        return vec(values[i])
+    before = vec(values[i - 1])
+    share = (t - stamps[i - 1]) / (stamps[i] - stamps[i - 1])
+    return before + share * (vec(values[i]) - before)
+
+
+@inlined
+def step_from(rows: Rows, imu_rows: int, dvl_rows: int, i: int, k: int, t: int, end_ns: int) -> Step:
+    """The step from t, of which i and k are the first rows after it, to the next stamp of either sensor or the end.
+
+    Only the first ``imu_rows`` and ``dvl_rows`` rows are used.
+    """
+    imu_ns, dvl_ns, hold_past, until = rows.imu_ns, rows.dvl_ns, rows.hold_past, end_ns
+    if i < imu_rows:
+        until = min(until, imu_ns[i])
+    if k < dvl_rows:
+        until = min(until, dvl_ns[k])
+    middle = t + (until - t) // 2
+    f, turn_psd = value_at(imu_ns, rows.force, imu_rows, i, middle, hold_past), ZERO
+    if rows.turns.is_modelled:
+        length_ns = hole_ns(imu_ns, imu_rows, i, until)
+        if length_ns > 0:
+            turn_psd = error_in_hole(rows.turns, imu_ns, imu_rows, i, t, until)
+        if length_ns > UNFELT_NS:
+            f = Vec3(np.nan, np.nan, np.nan)
+    last = min(k, dvl_rows - 1)
+    other = last if hold_past or k >= dvl_rows or last == 0 else last - 1
+    interval_s = (dvl_ns[last] - dvl_ns[last - 1]) * 1e-9 if last > 0 else 0.0
+    return Step(
+        until,
+        (until - t) * 1e-9,
+        value_at(imu_ns, rows.rate, imu_rows, i, middle, hold_past),
+        value_at(dvl_ns, rows.velocity, dvl_rows, k, middle, hold_past),
+        interval_s * (0.5 * (mat(rows.cov[last]) + mat(rows.cov[other]))),
+        f,
+        turn_psd,
+    )
+
+
+@inlined
+def has_gap(dvl_ns: Ints, n: int, k: int, start_ns: int, end_ns: int, longest_ns: int) -> bool:
+    """True where an interval, with row k the first Doppler row in it, has a longer time without any of the first n."""
+    while k < n and dvl_ns[k] < end_ns:
+        if dvl_ns[k] - start_ns > longest_ns:
+            return True
+        start_ns, k = dvl_ns[k], k + 1
+    return end_ns - start_ns > longest_ns
+
+
+@inlined
+def put(v: Vec3, out: Floats, row: int) -> None:
+    """Write a vector into a row of an array."""
+    out[row, 0], out[row, 1], out[row, 2] = v.x, v.y, v.z
