@@ -27,6 +27,7 @@ from sonar_graph.slam.landmarks import (
     TrackedIdentities,
 )
 from sonar_graph.slam.models import KernelParams
+from sonar_graph.slam.smoother import Changed
 from sonar_graph.states import DetectionJournal, DetectionLog, Outcome
 
 
@@ -61,9 +62,12 @@ class Frontend:
     def update_if_due(self) -> None:
         """Bring the smoother up to date, and the sightings in line with what it withheld and gave up."""
         if (changed := self._keyframes.update_if_due()) is not None:
-            self.landmarks.follow(changed)
-            if changed.left:
-                self._forget(changed.left)
+            self._follow(changed)
+
+    def advance(self, until_ns: int) -> None:
+        """Set the keyframes that are due at an instant."""
+        for changed in self._keyframes.advance(until_ns):
+            self._follow(changed)
 
     def _screened(self, frame: LandmarkDetections) -> SeenFrame | None:
         """Rows that may become sightings; all rows go to the journal."""
@@ -99,6 +103,11 @@ class Frontend:
         """Outcome of each detection in the same history."""
         self._forget(set())
         return self.landmarks.rechosen(self.policy.rechosen()).log()
+
+    def _follow(self, changed: Changed) -> None:
+        self.landmarks.follow(changed)
+        if changed.left:
+            self._forget(changed.left)
 
     def _forget(self, left: Set[int]) -> None:
         if given_up := self.policy.forget(self._keyframes.advanced_ns, left):

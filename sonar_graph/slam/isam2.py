@@ -146,9 +146,9 @@ class Isam2:
         self._keyframes.add(measurements.imu, measurements.dvl, measurements.depth)
         if measurements.detections is not None:
             for frame in measurements.detections.frames():
-                self._keyframes.advance(int(frame.stamps_ns[0]))
+                self._sightings.advance(int(frame.stamps_ns[0]))
                 self._sightings.add(frame)
-        self._keyframes.advance(measurements.end_ns)
+        self._sightings.advance(measurements.end_ns)
         self._sightings.update_if_due()
         if self._keyframes.newest_ns is None:
             return None

@@ -156,13 +156,17 @@ class Keyframes:
         """Rows of IMU, Doppler log and depth that are not used, and why."""
         return self.odometry.refused + self._refused
 
-    def advance(self, until_ns: int) -> None:
-        """Set the keyframes that are due from epochs reached at an instant; the first starts the graph."""
+    def advance(self, until_ns: int) -> list[Changed]:
+        """Set the keyframes that are due from epochs reached at an instant; the first starts the graph.
+
+        Each has an update of its own, so that a result does not depend on how a log is cut; returns what these changed.
+        """
         self.advanced_ns = max(self.advanced_ns, until_ns)
+        changes = []
         if not self.stamps_ns:
             start_ns = self.odometry.start_by(until_ns)
             if start_ns is None:
-                return
+                return []
             self.stamps_ns.append(start_ns)
             self._bias_since_ns = start_ns
             self.smoother.add_pose(X(0), self.calibration.start.pose(), start_ns * S_PER_NS)
@@ -172,10 +176,13 @@ class Keyframes:
                 self.smoother.add_bias(B(0), np.zeros(3))
                 self.smoother.add({"bias prior": factors.bias_prior(B(0), self.calibration.imu.gyro_bias_sigma)})
             self._constrain(0)
+            changes.append(self.smoother.update(self.newest_s))
         interval_ns = round(self.params.max_interval_s / S_PER_NS)
         for node_ns in self.odometry.epochs(self.stamps_ns[-1], until_ns).tolist():
             if node_ns - self.stamps_ns[-1] >= interval_ns:
                 self._set(node_ns)
+                changes.append(self.smoother.update(self.newest_s))
+        return changes
 
     def set_for_frame(self, stamp_ns: int, motion: PreintegratedMotion) -> PreintegratedMotion:
         """Set a keyframe if a frame needs a newer one; the motion from the then newest keyframe to the frame."""

@@ -23,6 +23,14 @@ TROUBLES = {
     "wrong": {"wrong_id_rate": 1.0, "wrong_id_share": 0.8},
     "late and wrong": {"id_delay_s": 2.0, "wrong_id_rate": 1.0, "wrong_id_share": 0.6},
 }
+POLICIES = {
+    "robust": {},
+    "gate": {"identity__policy": "gate", "identity__gate_probability": 0.99},
+    "bounded": {"history__policy": "bounded", "smoother__lag_s": 3.0},
+    "short": {"smoother__lag_s": 1.6},
+    "associate": {"identity__unknown__policy": "associate"},
+    "max-mixture": {"identity__policy": "max-mixture"},
+}
 OBJECTS = np.array([[4.0, 0.8, -1.4], [5.0, 0.2, -1.6], [4.5, 1.6, -1.5]])
 GAP_S = 0.7
 

@@ -284,16 +284,17 @@ def test_a_sighting_that_places_no_landmark_is_withheld_and_its_landmark_begins_
     """
     ids, stamps = mission().detections.most_probable()[0], mission().detections.stamps_ns
     row = max(int(np.argmax(ids == landmark)) for landmark in set(ids.tolist()) if np.sum(ids == landmark) > 5)
-    beginning, faulty = SightingFactors._placed, []
+    make, faulty = SightingFactors.make, []
 
-    def without_once(self, sighting, key):
+    def without_once(self, sighting, key, *, is_first):
+        made = make(self, sighting, key, is_first=is_first)
         if sighting.stamp_ns == stamps[row] and key == L(ids[row]):
             faulty.append(key)
-            return {}
-        return beginning(self, sighting, key)
+            return {label: made[label] for label in made if label not in ("first direction", "floor prior")}
+        return made
 
     expected, others = run(without(row), history)
-    monkeypatch.setattr(SightingFactors, "_placed", without_once)
+    monkeypatch.setattr(SightingFactors, "make", without_once)
     found, estimates = run(mission(), history)
     outcomes = found.detections().outcomes
     assert len(faulty) == 1

@@ -119,6 +119,26 @@ def test_a_landmark_whose_sightings_have_left_counts_as_one_more() -> None:
     assert landmarks.any_sighting(7) is first
 
 
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        (Outcome.FORGOTTEN, Outcome.USED_LATER),
+        (Outcome.NO_IDENTITY, Outcome.WAITING),
+        (Outcome.WAITING, Outcome.TAKEN_BACK),
+        (Outcome.GATED, Outcome.USED_LATER),
+        (None, Outcome.FORGOTTEN),
+        (Outcome.WAITING, Outcome.WITHHELD),
+    ],
+)
+def test_a_state_that_may_not_follow_is_refused_and_changes_nothing(before: Outcome | None, after: Outcome) -> None:
+    landmarks = begun()
+    sighting = sighting_of(7, 0, None, landmarks)
+    sighting.outcome = before
+    with pytest.raises(AssertionError, match="cannot become"):
+        landmarks.apply([Assignment(sighting, after, 7)], float(POSES))
+    assert (sighting.outcome, landmarks.ids, landmarks.journal.log().outcomes) == (before, [], [Outcome.WAITING])
+
+
 MOUNTED = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.0, 0.4, 0.0), np.array([0.3, 0.0, -0.1]))
 POINT = np.array([3.0, 0.5, -1.7])
 

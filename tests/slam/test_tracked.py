@@ -15,9 +15,11 @@ from sonar_graph.measurements import NO_TRACK
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 from sonar_graph.slam import RobustKernel
+from sonar_graph.slam.landmarks.landmark_graph import IN_GRAPH
 from sonar_graph.slam.smoother import incremental as smoother_module
 from sonar_graph.slam.smoother.incremental import Smoother
 from sonar_graph.states import Outcome
+from sonar_graph.testing.laws import EstimatorRun, difference
 
 from .dive import CALIBRATION, NS, T0_NS, TRUSTING, UNGATED, Dive
 from .graphs import assert_same_factors, assert_same_graph, factors_of, rows_of
@@ -28,6 +30,7 @@ from .late_identities import (
     IDS,
     LATE,
     OBJECTS,
+    POLICIES,
     SURE,
     TROUBLES,
     Watch,
@@ -135,15 +138,39 @@ def test_a_displaced_sighting_is_used_when_its_place_becomes_free_though_its_tra
     assert_same_factors(dive.smoother.graph, known.smoother.graph, known.smoother.values)
 
 
-def test_the_end_does_not_depend_on_how_the_log_is_cut():
-    """Estimates at the whole seconds, asked for alone and among others."""
-    sequence = simulate_basin(BasinOptions(**BASIN, **TROUBLES["late and wrong"]))
-    (one, seldom), (other, often) = ran(sequence, 1.0), ran(sequence, 4.0)
-    found, others = ({each.stamp_ns: each.world_T_body.matrix() for each in of} for of in (seldom, often))
-    shared = found.keys() & others.keys()
-    assert len(shared) > 100
-    assert max(np.abs(found[ns] - others[ns]).max() for ns in shared) < 1e-12
-    assert one.detections().outcomes == other.detections().outcomes
+def answers(policy: str, rate_hz: float) -> EstimatorRun:
+    """Of a run with identities that are late, wrong and missing; estimates at tens of seconds."""
+    sequence = simulate_basin(BasinOptions(**BASIN, **TROUBLES["late and wrong"], anonymous_share=0.3))
+    estimator, causal = ran(sequence, rate_hz, **POLICIES[policy])
+    tens = {int(stamp_ns) for stamp_ns in sequence.instants(0.1)}
+    told = [estimate for estimate in causal if estimate.stamp_ns in tens]
+    smoothed = estimator.trajectory()
+    at = np.isin(smoothed.stamps_ns, list(tens))
+    return EstimatorRun(told, smoothed.rows(np.flatnonzero(at)), estimator.landmarks(), estimator.detections())
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+def test_how_a_log_is_cut_into_calls_changes_nothing(policy: str):
+    """Calls every ten seconds and four a second; motions to an instant that lies between epochs differ by rounding."""
+    seldom, often = answers(policy, 0.1), answers(policy, 4.0)
+    assert len(seldom.estimates) > 10
+    assert seldom.detections.outcomes == often.detections.outcomes
+    assert np.array_equal(seldom.detections.landmark_ids, often.detections.landmark_ids)
+    assert np.allclose(seldom.trajectory.positions, often.trajectory.positions, rtol=0, atol=1e-12)
+    assert difference(seldom, often) < 1e-12
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+def test_the_journal_says_of_each_sighting_in_the_graph_what_it_is_of(policy: str):
+    sequence = simulate_basin(BasinOptions(**BASIN, **TROUBLES["late and wrong"], anonymous_share=0.3))
+    estimator = run(sequence, **POLICIES[policy])
+    landmarks = estimator._sightings.landmarks
+    log, inside = landmarks.journal.log(), {s.row: i for i in landmarks.ids for s in landmarks.sightings(i)}
+    for row, landmark_id in inside.items():
+        assert (log.landmark_ids[row], log.outcomes[row] in IN_GRAPH) == (landmark_id, True)
+    is_used = {row for row, outcome in enumerate(log.outcomes) if outcome in IN_GRAPH}
+    assert len(is_used) > 10
+    assert is_used == set(inside) or any(map(landmarks.is_rooted, landmarks.ids))
 
 
 NEW, USED, WAITING = Outcome.NEW, Outcome.USED, Outcome.WAITING
@@ -229,14 +256,6 @@ def test_while_sightings_wait_the_window_stays_open_for_them(monkeypatch):
         assert dive.outcomes == [Outcome.USED_LATER] * 9 + [Outcome.USED]
 
 
-POLICIES = {
-    "robust": {},
-    "gate": {"identity__policy": "gate", "identity__gate_probability": 0.99},
-    "bounded": {"history__policy": "bounded", "smoother__lag_s": 3.0},
-    "short": {"smoother__lag_s": 1.6},
-    "associate": {"identity__unknown__policy": "associate"},
-    "max-mixture": {"identity__policy": "max-mixture"},
-}
 NODES = 10
 ROWS = len(rail(NODES)[1].ranges)
 BELIEFS_OF_REPEATED_TRACKS = [*SURE.values(), FLAT, [0.0] * 4, [0.0, 0.9, 0.0, 0.05]]

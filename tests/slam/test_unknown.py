@@ -110,11 +110,24 @@ def test_scattered_detections_of_nothing_begin_no_landmark():
     assert len(run(nothing, identity__unknown__policy="associate", identity__unknown__sightings=1).landmarks()) > 4
 
 
-def named_late(share: float = 0.4) -> Sequence:
+def named_late(sequence: Sequence | None = None, share: float = 0.4) -> Sequence:
     """The detections of a first share of the run name nothing."""
-    seen = clean().detections
+    seen = (sequence or clean()).detections
     until_ns = seen.stamps_ns[0] + round(share * (seen.stamps_ns[-1] - seen.stamps_ns[0]))
-    return anonymous_where(clean(), seen.stamps_ns < until_ns)
+    return anonymous_where(sequence or clean(), seen.stamps_ns < until_ns)
+
+
+@pytest.mark.parametrize("history", ["whole", "bounded"])
+@pytest.mark.parametrize("lag_s", [12.0, 3.0])
+def test_what_waits_leaves_with_its_keyframe_also_while_all_that_is_seen_has_a_name(history: str, lag_s: float):
+    """False detections of a first part, without names, wait when the second begins, in which landmarks are merged."""
+    sequence = named_late(simulate_basin(BasinOptions(**TWO_LAPS, tracks=True, false_detections_per_frame=0.05)))
+    settings = {"history__policy": history, "smoother__lag_s": lag_s, "smoother__stale_shift_m": 0.01}
+    estimator = run(sequence, identity__unknown__policy="associate", **settings)
+    outcomes = assert_outcomes_account(estimator, sequence)
+    assert outcomes[Outcome.FORGOTTEN] > 10
+    assert outcomes[Outcome.WAITING] == 0
+    assert {1, 2, 3, 4} <= set(estimator.landmarks().ids.tolist())
 
 
 @pytest.mark.parametrize("lag_s", [1e9, 15.0, 2.0])
