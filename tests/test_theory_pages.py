@@ -1,6 +1,7 @@
-"""What pages of theory quote is what their scripts print."""
+"""Quotations on pages of theory: what scripts print, and lines of code."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -20,3 +21,14 @@ def test_recognition_quotes_what_its_script_prints_and_draws(tmp_path):
     assert f"```\n{done.stdout}```\n" in page
     drawn, shown = (cv2.imread(os.fspath(path)) for path in (picture, THEORY.parent / "images" / "recognition.png"))
     assert drawn.shape == shown.shape
+
+
+def test_lines_quoted_on_the_way_from_the_paper_stand_in_the_files():
+    code, quoted = "", []
+    for line in (THEORY / "from_the_paper.md").read_text(encoding="utf-8").splitlines():
+        if named := re.findall(r"`((?:sonar_graph|baselines)/[a-z_/0-9]+[.]py)`", line):
+            code = (THEORY.parents[1] / named[-1]).read_text(encoding="utf-8")
+        if row := re.fullmatch(r"\| .* \| `(.*)` \|", line):
+            quoted.append(row[1])
+            assert row[1] in code
+    assert len(quoted) >= 20
