@@ -22,7 +22,6 @@ from typing import Any, NamedTuple
 import numba.extending
 import numpy as np
 from numba import types
-from scipy.spatial.transform import Rotation
 
 from sonar_graph.measurements import Floats
 from sonar_graph.numerics.jit import inlined
@@ -283,13 +282,3 @@ def euler_rates_from_body(angles: Vec3) -> Mat3:
     """E of the module's docstring."""
     c_r, s_r, c_p, t_p = math.cos(angles.x), math.sin(angles.x), math.cos(angles.y), math.tan(angles.y)
     return Mat3(Vec3(1.0, s_r * t_p, c_r * t_p), Vec3(0.0, c_r, -s_r), Vec3(0.0, s_r / c_p, c_r / c_p))
-
-
-def running_rotations(turns: Floats) -> Floats:
-    """``I, Exp(turns[0]), Exp(turns[0]) Exp(turns[1]), ...`` of n rotation vectors, (n + 1, 3, 3), by doubling."""
-    products = Rotation.from_rotvec(np.concatenate([np.zeros((1, 3)), turns])).as_matrix()
-    span = 1
-    while span <= len(turns):  # each product spans so many turns, or all before it
-        products[span:] = products[:-span] @ products[span:]
-        span *= 2
-    return products

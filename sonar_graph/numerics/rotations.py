@@ -1,9 +1,10 @@
-"""Rotations as arrays, for compiled code; in loops over samples: `sonar_graph.numerics.matrices`.
+"""Rotations as arrays; in compiled loops over samples: `sonar_graph.numerics.matrices`.
 
 Forster et al., "On-Manifold Preintegration", IEEE TRO 33(1), 2017, (3), (8), (9).
 """
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from sonar_graph.measurements import Floats
 from sonar_graph.numerics.jit import compiled
@@ -46,3 +47,13 @@ def left_jacobian(phi: Floats) -> Floats:
         b, c = (1.0 - np.cos(angle)) / angle2, (angle - np.sin(angle)) / (angle2 * angle)
     K = cross_matrix(phi)
     return np.eye(3) + b * K + c * (K @ K)
+
+
+def running_rotations(turns: Floats) -> Floats:
+    """``I, Exp(turns[0]), Exp(turns[0]) Exp(turns[1]), ...`` of n rotation vectors, (n + 1, 3, 3), by doubling."""
+    products = Rotation.from_rotvec(np.concatenate([np.zeros((1, 3)), turns])).as_matrix()
+    span = 1
+    while span <= len(turns):  # each product spans so many turns, or all before it
+        products[span:] = products[:-span] @ products[span:]
+        span *= 2
+    return products

@@ -25,7 +25,7 @@ import gtsam
 import numpy as np
 
 from sonar_graph.measurements import Floats
-from sonar_graph.numerics import compiled, cross_matrix
+from sonar_graph.numerics import compiled
 
 FLOOR_GATE = 10.83
 """Gate for "the landmark stands on the floor": the 0.999 quantile of chi-square with one degree of freedom.
@@ -149,7 +149,7 @@ def locate_jacobians(
     R_body, R_sonar = world_T_body.rotation().matrix(), world_T_sonar.rotation().matrix()
     point = locate(world_T_sonar, range_m, azimuth_rad, elevation_rad)
     p_body = np.asarray(world_T_body.transformTo(point), dtype=np.float64)
-    by_pose = R_body @ np.hstack([-cross_matrix(p_body), np.eye(3)])
+    by_pose = R_body @ np.hstack([-gtsam.SO3.Hat(p_body), np.eye(3)])
     return point, by_pose, R_sonar @ sonar_point_jacobian(range_m, azimuth_rad, elevation_rad)
 
 
