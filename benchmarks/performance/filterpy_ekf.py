@@ -1,8 +1,8 @@
 """The same EKF-SLAM as `baselines.ekf_slam`, written the way filterpy is used: dense matrices, one prediction a sample.
 
 State, motion model, noise, rules and order of events are the same, the code is not: F, Q and H are full matrices, every
-IMU or Doppler sample is a prediction, corrections are filterpy's (Joseph's form). The motion of a sample comes from
-`sonar_graph.navigation`. On request there is one prediction a DVL node instead, over the motion preintegrated since the
+IMU or Doppler sample is a prediction, corrections are filterpy's (Joseph's form). The motion of a sample comes from the
+same `sonar_graph.navigation.Odometry`. On request there is one prediction a DVL node instead, over the motion since the
 node before, as `baselines.ekf_slam` has it.
 """
 
@@ -10,15 +10,15 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from itertools import pairwise
 
 import gtsam
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.measurements import NS_PER_S, Floats
-from sonar_graph.navigation import Odometry, PreintegratedMotion
+from sonar_graph.measurements import NS_PER_S, Floats, Ints
+from sonar_graph.motion import PreintegratedMotion
+from sonar_graph.navigation import Odometry
 from sonar_graph.navigation.alignment import gravity_direction
 from sonar_graph.sequence import Sequence
 from sonar_graph.slam.landmarks import gate_threshold, identify
@@ -177,27 +177,38 @@ class _Feed:
     predicts_by_node: bool
     nodes: int = 0
 
+    def motions(self, stamps_ns: Ints, known_ns: int) -> list[PreintegratedMotion]:
+        """Motions from each stamp to the next, from rows stamped no later than an instant."""
+        known = np.full(len(stamps_ns) - 1, known_ns)
+        rows = zip(*self.odometry.motions(stamps_ns[:-1], stamps_ns[1:], known, NO_BIAS), strict=True)
+        return [
+            PreintegratedMotion(gtsam.Pose3(gtsam.Rot3(dR), dp), C, D, NO_BIAS, duration_s, impulse / duration_s)
+            for (dR, dp, C, D, impulse), duration_s in zip(rows, np.diff(stamps_ns) * 1e-9, strict=True)
+        ]
+
     def advance(self, until_ns: int) -> None:
-        for node_ns in self.odometry.epochs(self.node_ns, until_ns).tolist():
-            cuts_ns = [self.node_ns, node_ns]
+        epochs_ns = self.odometry.epochs(self.node_ns, until_ns)
+        for node_ns, reached_ns in zip(epochs_ns.tolist(), self.odometry.reached_ns(epochs_ns).tolist(), strict=True):
+            stamps_ns = np.array([self.node_ns, node_ns])
             if not self.predicts_by_node:
-                inertial_ns = self.sequence.imu.stamps_ns
-                between = (inertial_ns > self.node_ns) & (inertial_ns < node_ns)
-                cuts_ns[1:1] = inertial_ns[between].tolist()
-            known_ns = int(self.odometry.reached_ns(np.array([node_ns]))[0])
-            motions = [self.odometry.motion(a, b, NO_BIAS, None, known_ns) for a, b in pairwise(cuts_ns)]
+                imu_ns = self.sequence.imu.stamps_ns
+                first, last = np.searchsorted(imu_ns, stamps_ns)
+                stamps_ns = np.unique(np.concatenate([stamps_ns, imu_ns[first:last]]))
+                stamps_ns = stamps_ns[stamps_ns >= self.node_ns]
+            motions = self.motions(stamps_ns, reached_ns)
             self.slam.timed(lambda motions=motions: [self.slam.predict(motion) for motion in motions])  # type: ignore[misc]
             self.node_ns, self.nodes = node_ns, self.nodes + 1
             if self.slam.calibration.use_gravity and node_ns - self.opened_ns >= GRAVITY_INTERVAL_NS:
-                self.gravity()
+                self.gravity(reached_ns)
 
-    def gravity(self) -> None:
+    def gravity(self, reached_ns: int) -> None:
         calibration = self.slam.calibration
-        (v_i, variance_i), (v_j, variance_j) = map(self.odometry.velocity_at_imu, (self.opened_ns, self.node_ns))
-        motion = self.odometry.motion(self.opened_ns, self.node_ns, NO_BIAS)
-        sigma_m_s = math.sqrt(0.5 * (variance_i + variance_j))
+        stamps_ns = np.array([self.opened_ns, self.node_ns])
+        ends, variances = zip(*(self.odometry.velocity_at_imu(int(t)) for t in stamps_ns), strict=True)
+        (motion,) = self.motions(stamps_ns, reached_ns)
+        sigma_m_s = math.sqrt(0.5 * sum(variances))
         self.opened_ns = self.node_ns
-        found = gravity_direction(motion, v_i, v_j, sigma_m_s, calibration.imu, calibration.gravity_m_s2)
+        found = gravity_direction(motion, *ends, sigma_m_s, calibration.imu, calibration.gravity_m_s2)
         if found is None:
             return
         up, sigma = found
@@ -206,7 +217,7 @@ class _Feed:
         self.slam.timed(lambda: self.slam.update_state(4, math.atan2(-up[0], level), sigma**2))
 
     def provisional(self, until_ns: int) -> PreintegratedMotion:
-        return self.odometry.motion(self.node_ns, until_ns, NO_BIAS)
+        return self.odometry.motion(self.node_ns, until_ns, NO_BIAS, None, until_ns)
 
     def depth(self, row: int) -> None:
         depth = self.sequence.depth

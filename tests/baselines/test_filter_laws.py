@@ -297,7 +297,7 @@ def test_the_outcome_depends_neither_on_how_the_log_is_cut_nor_on_being_asked(mi
     blocks = mission.imu, mission.dvl, mission.depth, mission.detections
     stamps = np.concatenate([block.stamps_ns for block in blocks])
     every_instant = np.unique(np.concatenate([stamps, mission.instants(50.0)]))
-    live, windows, whole = (begun(kind, mission.calibration) for _ in range(3))
+    live, windows, whole = (begun(kind, mission.calibration, gravity_interval_s=7.0) for _ in range(3))
     for row in mission.replay(every_instant[every_instant <= instants[-1]]):
         live.process(row)
     for window in mission.replay(instants):
@@ -368,8 +368,8 @@ def test_ekf_slam_on_filterpy_ends_in_the_same_state(monkeypatch, predicts_by_no
 
     mission = simulate_mission(MissionOptions(duration_s=40.0, landmarks=12, dvl_dropouts_per_hour=360.0))
     never_a_gap = mission.calibration.dvl.model_copy(update={"gap_s": 1e3})  # filterpy's takes straight lines
-    calibration = mission.calibration.model_copy(update={"dvl": never_a_gap})
-    slam = begun(EkfSlam, calibration)
+    mission = replace(mission, calibration=mission.calibration.model_copy(update={"dvl": never_a_gap}))
+    slam = begun(EkfSlam, mission.calibration)
     for window in mission.replay(mission.instants(2.0)):
         slam.process(window)
     theirs = filterpy_ekf.run(mission, int(mission.instants(2.0)[-1]), predicts_by_node=predicts_by_node)
@@ -503,6 +503,18 @@ def test_gravity_counts_once_an_interval_with_its_own_variance(kind):
     )
     slam = run(kind, Sequence("at rest", calibration, imu(seconds), dvl(seconds)))
     assert_allclose(height_and_tilt(slam)[2], noise**2 / calibration.gravity_m_s2**2 / seconds, rtol=1e-3)
+
+
+@slam_filters
+def test_gravity_has_the_velocity_noise_of_both_ends_of_its_interval(kind):
+    """At rest for one interval of a second, a Doppler log that grows ten times as exact, and a wide prior."""
+    known = {"gyro_noise_density": 1e-9, "gyro_bias_sigma": 0.0, "accel_bias_sigma": 0.0, "accel_noise_density": 1e-9}
+    calibration = Calibration(imu=ImuCalibration(**known), start=Start(rpy_sigma_rad=(1.0, 1.0, 1e-3)))
+    doppler, variances = dvl(1), np.array([4e-4] + [4e-6] * 5)
+    doppler = replace(doppler, velocity_cov=variances[:, None, None] * np.eye(3))
+    slam = run(kind, Sequence("at rest", calibration, imu(1.1), doppler))
+    expected = (variances[0] + variances[-1]) / calibration.gravity_m_s2**2
+    assert_allclose(height_and_tilt(slam)[2], expected, rtol=1e-3)
 
 
 @slam_filters

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from baselines.filter import SonarModel, far_view, is_inside
 from sonar_graph.calibration import FloorPrior, SonarCalibration
-from sonar_graph.measurements import NS_PER_S
+from sonar_graph.measurements import NS_PER_S, LandmarkDetections
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
@@ -168,6 +168,14 @@ def test_the_innovation_of_azimuth_wraps_around(filter_):
     is_used, e, _ = slam.observe(MOTION, 0, np.array([3.0, -math.pi + 0.004]), NOISE, may_be_far=False)
     assert is_used
     assert e[1] == pytest.approx(0.008, abs=1e-9)
+
+
+@pytest.mark.parametrize("hole", [(0, 0), (1, 1), (0, 1)])
+def test_noise_is_the_log_s_made_symmetric_and_where_it_has_a_hole_the_calibration_s(hole):
+    logged = np.array([[[4e-4, 3e-5], [1e-5, 1e-4]]] * 2)
+    logged[(1, *hole)] = math.nan
+    rows = LandmarkDetections(np.zeros(2, int), np.ones(2), np.ones(2), logged, np.ones((2, 1), int), np.ones((2, 1)))
+    assert_allclose(SonarModel.of(CALIBRATION, 0.999).noise_of(rows), [[[4e-4, 2e-5], [2e-5, 1e-4]], NOISE])
 
 
 # ---------------------------------------------------------------------------------------------- views from far away
