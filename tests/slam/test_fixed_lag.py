@@ -7,7 +7,7 @@ from gtsam.symbol_shorthand import B, L, X
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonar_graph.slam.smoother import fixed_lag
+from sonar_graph.slam.smoother import Sightline, fixed_lag
 from sonar_graph.slam.smoother.factor_store import FactorGroup, FactorStore
 from sonar_graph.slam.smoother.fixed_lag import SmootherWindow, marginal, picked
 
@@ -111,7 +111,8 @@ def test_what_was_put_in_and_not_taken_out_is_in(choices: list[int]):
             store.remove([inside.pop(choice)])
         else:
             prior = point_prior(L(choice), ORIGIN)
-            inside[choice] = store.add(FactorGroup({"one": prior, "two": prior}, (L(choice), number)))
+            line = Sightline(X(number), gtsam.Pose3(), ORIGIN[:2])
+            inside[choice] = store.add(FactorGroup({"one": prior, "two": prior}, (L(choice), line)))
         assert [f.keys()[0] for f in factors_of(store.graph())][::2] == [L(named) for named in inside]
         assert store.size == store.graph().size() == 2 * len(inside)
         assert store.sightlines().keys() == set(map(L, inside))
@@ -125,8 +126,10 @@ def test_a_group_leaves_with_its_oldest_pose_or_bias_and_those_on_landmarks_alon
     walk = gtsam.BetweenFactorPoint3(B(0), B(1), ORIGIN, isotropic(3, 1.0))
     made = {"prior": point_prior(L(3), ORIGIN), "old": factor(1, 1.0), "walk": walk, "odometry": factor(2, 1.0)}
     lone, old, walked, later = (store.add(FactorGroup({name: each})) for name, each in made.items())
+    sighting = store.add(FactorGroup({"range": made["prior"]}, (L(3), Sightline(X(1), gtsam.Pose3(), ORIGIN[:2]))))
     store.leave([X(0)])
-    assert store.graph().size() == store.size == 3
+    assert store.graph().size() == store.size == 4
+    assert store.factors([sighting]) == [made["prior"]]
     with pytest.raises(KeyError):
         store.factors([old])
     store.remove([later])

@@ -48,9 +48,13 @@ class FactorStore:
         handle, self._next = self._next, self._next + 1
         self._groups[handle] = self.new[handle] = group
         self.size += len(group.factors)
-        keys = {key for factor in group for key in list(factor.keys())}
-        poses = [key for key in keys if gtsam.symbolChr(key) == POSE]
-        if lasting := poses or [key for key in keys if gtsam.symbolChr(key) != LANDMARK]:
+        if group.seen is not None:
+            lasting = [group.seen[1].pose_key]
+        else:
+            keys = {key for factor in group for key in list(factor.keys())}
+            poses = [key for key in keys if gtsam.symbolChr(key) == POSE]
+            lasting = poses or [key for key in keys if gtsam.symbolChr(key) != LANDMARK]
+        if lasting:
             self._leaving_with[min(lasting)].append(handle)
         return handle
 
