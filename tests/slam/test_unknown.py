@@ -21,8 +21,8 @@ from sonar_graph.slam.landmarks.sighting import Sighting, SightingFactors, late_
 from sonar_graph.slam.landmarks.unknown import (
     ODDS,
     AssociatedUnknown,
-    LandmarkMerging,
     NamelessLandmarks,
+    nearest_duplicates,
 )
 from sonar_graph.slam.smoother.batch_solution import JointCovariance, Sightline
 from sonar_graph.slam.smoother.incremental import Smoother
@@ -248,18 +248,19 @@ def nearest(
     """Of landmarks at points with a joint covariance, each seen in some frames; rooted ones also before the window."""
     smoother = smoother_with(1e9, 0.1, 1e9)
     landmarks = LandmarkGraph(smoother, SightingFactors(SonarCalibration(), plain), DetectionJournal())
-    values = gtsam.Values()
+    values, ids = gtsam.Values(), {i: i if i in named else FIRST_ANONYMOUS_ID + i for i in points}
     for (i, point), range_m in zip(points.items(), ranges_m, strict=True):
-        values.insert(L(i), np.array(point))
+        values.insert(L(ids[i]), np.array(point))
         for stamp_ns in frames[i]:
             noise = np.diag([NOISE_M**2, (NOISE_M / 2) ** 2])
             sighting = Sighting(stamp_ns, 0, Sightline(X(0), gtsam.Pose3(), np.array([range_m, 0.0])), noise, None)
-            landmarks._put(sighting, i, None)
+            landmarks._put(sighting, ids[i], None)
         if i in rooted:
-            landmarks._rooted[i] = sighting
-    joint = JointCovariance(cov, {L(i): 3 * k for k, i in enumerate(points)})
-    merging = LandmarkMerging(landmarks, PROBABILITY, log_rival)
-    return merging.nearest(values, joint, named, [i for i in points if i not in named])
+            landmarks._rooted[ids[i]] = sighting
+    joint = JointCovariance(cov, {L(ids[i]): 3 * k for k, i in enumerate(points)})
+    policy = AssociatedUnknown(gate_probability=PROBABILITY, density_m2=math.exp(log_rival) / ODDS)
+    found = nearest_duplicates(landmarks, values, joint, policy)
+    return found and (found[0] % FIRST_ANONYMOUS_ID, found[1] % FIRST_ANONYMOUS_ID)
 
 
 def shared(count: int, common_sigma: float, own_sigma: float) -> np.ndarray:
@@ -305,5 +306,5 @@ def test_a_wide_difference_says_nothing(own_sigma: float):
 
 
 def test_without_merging_they_stay_two(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(module.LandmarkMerging, "nearest", lambda *_: None)
+    monkeypatch.setattr(module, "nearest_duplicates", lambda *_: None)
     assert len(run(named_late(), **ASSOCIATED).landmarks()) > 4

@@ -163,16 +163,17 @@ def believed(innovations: Innovations, pairing: Pairing, log_rivals: Floats) -> 
         for first in range(0, len(e), 2):
             at = slice(first, first + 2)
             S = np.linalg.inv(A[at, at])
-            given.append(_log_density(S @ weighed[at], S))
+            given.append(log_density(S @ weighed[at], S))
         excess = np.array(given) - log_rivals[paired]
         worst = int(np.argmin(excess))
         if excess[worst] > 0:
-            is_likely = _log_density(e, C) > float(log_rivals[paired].sum())
+            is_likely = log_density(e, C) > float(log_rivals[paired].sum())
             return Pairing(landmarks, float(e @ np.linalg.solve(C, e))) if is_likely else nothing
         landmarks = tuple(UNPAIRED if i == paired[worst] else at for i, at in enumerate(landmarks))
     return nothing
 
 
-def _log_density(e: Floats, C: Floats) -> float:
+def log_density(e: Floats, C: Floats) -> float:
+    """Logarithm of ``N(e; 0, C)``."""
     log_det = float(np.linalg.slogdet(C)[1])
     return -0.5 * (float(e @ np.linalg.solve(C, e)) + log_det + len(e) * math.log(2 * math.pi))

@@ -32,57 +32,13 @@ from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats, LandmarkDetections
 from sonar_graph.slam.keyframes import Keyframes
 from sonar_graph.slam.landmarks.association import gate_threshold
-from sonar_graph.slam.landmarks.joint_compatibility import UNPAIRED, Innovations, believed, pair_jointly
+from sonar_graph.slam.landmarks.joint_compatibility import UNPAIRED, Innovations, believed, log_density, pair_jointly
 from sonar_graph.slam.landmarks.landmark_graph import Assignment, LandmarkGraph
 from sonar_graph.slam.landmarks.sighting import SeenFrame, Sighting, place, source
 from sonar_graph.slam.models import PredictedView, wrap_angle
 from sonar_graph.slam.smoother import JointCovariance
 from sonar_graph.states import FIRST_ANONYMOUS_ID, Outcome
 from sonar_graph.tagged_sections import tagged
-
-
-class LandmarkMerging:
-    """Finds two landmarks of the graph that are one, inside a gate and denser than a rival (logarithm of 1/m²)."""
-
-    def __init__(self, landmarks: LandmarkGraph, gate_probability: float, log_rival: float) -> None:
-        self._landmarks = landmarks
-        self._gate = gate_threshold(gate_probability, 3)
-        self._log_rival = log_rival
-
-    def nearest(
-        self, values: gtsam.Values, covariance: JointCovariance, named: list[int], anonymous: list[int]
-    ) -> tuple[int, int] | None:
-        """Nearest two landmarks that are one, or None: that which stays and that which becomes part of it.
-
-        A named landmark stays, of two anonymous ones the one with the lower identity.
-        """
-        pairs = [(a, b) for b in anonymous for a in named] + list(combinations(sorted(anonymous), 2))
-        if not pairs:
-            return None
-        points = {i: values.atPoint3(L(i)) for i in {i for pair in pairs for i in pair}}
-        rows = {i: covariance.rows[L(i)] + np.arange(3) for i in points}
-        a, b = (np.array([rows[pair[side]] for pair in pairs]) for side in (0, 1))
-        P, d = covariance.matrix, np.array([points[i] - points[j] for i, j in pairs])
-        signed = ((1, a, a), (1, b, b), (-1, a, b), (-1, b, a))
-        S = np.asarray(sum(sign * P[i[:, :, None], j[:, None, :]] for sign, i, j in signed))
-        noise = {}
-        for i in points:  # of a sighting, across or along its beam, whichever is larger, m²
-            sighting = self._landmarks.any_sighting(i)
-            noise[i] = float(max(sighting.noise[0, 0], sighting.line.z[0] ** 2 * sighting.noise[1, 1]))
-        S = S + np.array([max(noise[i], noise[j]) for i, j in pairs])[:, None, None] * np.eye(3)
-        distance = np.einsum("ki,ki->k", d, np.linalg.solve(S, d[..., None])[..., 0])
-        near = [k for k in np.argsort(distance).tolist() if distance[k] <= self._gate]
-        for k in near:
-            stays, goes = pairs[k]
-            of_both = self._landmarks.stamps_ns(stays) & self._landmarks.stamps_ns(goes)
-            level = S[k][:2, :2]
-            log_density = -0.5 * (
-                float(d[k][:2] @ np.linalg.solve(level, d[k][:2])) + float(np.linalg.slogdet(level)[1])
-            ) - math.log(2 * math.pi)
-            if log_density > self._log_rival and not of_both and not self._landmarks.is_rooted(goes):
-                return stays, goes
-        return None
-
 
 ROUNDING_S = 1e-3
 """A keyframe as old as the lag may have left the window."""
@@ -129,6 +85,40 @@ def unnamed(frame: LandmarkDetections) -> NDArray[np.bool_]:
     return np.asarray((frame.candidate_ids < 0).all(axis=1))
 
 
+def nearest_duplicates(
+    landmarks: LandmarkGraph, values: gtsam.Values, covariance: JointCovariance, params: AssociatedUnknown
+) -> tuple[int, int] | None:
+    """Nearest two landmarks that are one, or None: that which stays and that which becomes part of it.
+
+    A named landmark stays, of two anonymous ones the one with the lower identity. The covariance is of all of them.
+    """
+    named = [i for i in landmarks.ids if i < FIRST_ANONYMOUS_ID]
+    nameless = landmarks.ids[len(named) :]
+    pairs = [(a, b) for b in nameless for a in named] + list(combinations(nameless, 2))
+    if not pairs:
+        return None
+    points = {i: values.atPoint3(L(i)) for i in landmarks.ids}
+    rows = {i: covariance.rows[L(i)] + np.arange(3) for i in points}
+    a, b = (np.array([rows[pair[side]] for pair in pairs]) for side in (0, 1))
+    P, d = covariance.matrix, np.array([points[i] - points[j] for i, j in pairs])
+    signed = ((1, a, a), (1, b, b), (-1, a, b), (-1, b, a))
+    S = np.asarray(sum(sign * P[i[:, :, None], j[:, None, :]] for sign, i, j in signed))
+    noise = {}
+    for i in points:  # of a sighting, across or along its beam, whichever is larger, m²
+        sighting = landmarks.any_sighting(i)
+        noise[i] = float(max(sighting.noise[0, 0], sighting.line.z[0] ** 2 * sighting.noise[1, 1]))
+    S = S + np.array([max(noise[i], noise[j]) for i, j in pairs])[:, None, None] * np.eye(3)
+    distance = np.einsum("ki,ki->k", d, np.linalg.solve(S, d[..., None])[..., 0])
+    for k in np.argsort(distance).tolist():
+        stays, goes = pairs[k]
+        is_near = distance[k] <= gate_threshold(params.gate_probability, 3)
+        of_both = landmarks.stamps_ns(stays) & landmarks.stamps_ns(goes)
+        is_dense = is_near and log_density(d[k][:2], S[k][:2, :2]) > params.log_rival
+        if is_dense and not of_both and not landmarks.is_rooted(goes):
+            return stays, goes
+    return None
+
+
 Candidate = list[Sighting]
 """Sightings that may be of one landmark, in the order of time."""
 
@@ -151,7 +141,6 @@ class NamelessLandmarks:
         self._landmarks, self._keyframes, self._params = landmarks, keyframes, params
         self._smoother, self._factors = landmarks.smoother, landmarks.factors
         self._longest_wait_s = max(min(params.longest_wait_s, self._smoother.params.lag_s - ROUNDING_S), 0.0)
-        self._merging = LandmarkMerging(landmarks, params.gate_probability, params.log_rival)
         self._candidates: list[Candidate] = []
         self._next_id = FIRST_ANONYMOUS_ID
 
@@ -171,11 +160,9 @@ class NamelessLandmarks:
         ``taken``: landmarks that are named in this frame.
         """
         yield self.forget()
-        named = [i for i in self._landmarks.ids if i < FIRST_ANONYMOUS_ID]
-        nameless = self._landmarks.ids[len(named) :]
-        if nameless and len(self._landmarks.ids) > 1:
+        if len(self._landmarks.ids) > 1 and self._landmarks.ids[-1] >= FIRST_ANONYMOUS_ID:
             joint = self._smoother.joint_covariance([self._keyframes.newest_key, *self._keys()])
-            if found := self._merging.nearest(self._smoother.values, joint, named, nameless):
+            if found := nearest_duplicates(self._landmarks, self._smoother.values, joint, self._params):
                 stays, goes = found
                 yield [Assignment(s, Outcome.MOVED, stays) for s in self._landmarks.sightings(goes)]
         if not rows:
