@@ -94,6 +94,8 @@ def bridge(
         # Velocities go on, inertial rows are missing: by velocities as far as they go.
         last_ns = int(dvl_ns[np.searchsorted(dvl_ns, end_ns, side="right") - 1])
         sampled = motion_over(rows, sensors, start_ns, last_ns, end_ns, bias, earth)
+        if last_ns == end_ns:
+            return sampled
         return sampled.then(_walk(rows, sensors, last_ns, end_ns, bias, sampled.i_T_j.rotation().unrotate(earth)))
     if is_closed:
         before_s = (dvl_ns[k] - dvl_ns[k - 1]) * 1e-9 if k > 0 else 0.0
@@ -149,11 +151,11 @@ def _inertial(
         turn = window.i_T_j.rotation().matrix()
     rate = np.column_stack([np.interp(cuts_ns, imu_ns[:imu_rows], column[:imu_rows]) for column in rows.rate.T])
     jumps[:-1] = weights_s[:, None] * (rows.velocity[samples] - np.cross(rate - bias, arm))
+    still = np.zeros((len(samples), 3))
     if is_closed:
-        line = Line(cuts_ns, True, weights_s[:1], jumps[:2], np.zeros((2, 1, 3)), start_ns)
+        line = Line(cuts_ns, True, weights_s[:1], jumps[:2], still[:1], still[:1], start_ns)
     else:
-        n, cuts_ns = len(samples), np.append(cuts_ns, end_ns)
-        line = Line(cuts_ns, True, np.cumsum(weights_s), jumps, np.zeros((2, n, 3)), start_ns)
+        line = Line(np.append(cuts_ns, end_ns), True, np.cumsum(weights_s), jumps, still, still, start_ns)
     sums = sums_along(rows, imu_rows, line, turn.T, bias, earth)
     R, T = sums.R[-1], (end_ns - start_ns) * 1e-9
     v, _, s = sums.whole.reshape(3, 3)

@@ -24,8 +24,8 @@ import numpy as np
 
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.navigation.imu_gaps import UNFELT_NS, hole_ns
-from sonar_graph.navigation.steps import Rows, put, rows_until, value_at
-from sonar_graph.numerics import O3, ZERO, Vec3, compiled, cross, exp_and_mean, mat, store, vec
+from sonar_graph.navigation.steps import Rows, row, rows_until, value_at
+from sonar_graph.numerics import O3, ZERO, Vec3, compiled, cross, exp_and_mean, inlined, mat, store, vec
 
 
 class Line(NamedTuple):
@@ -39,8 +39,10 @@ class Line(NamedTuple):
     """Sum of the samples' weights in each interval, shape (m,), s."""
     jumps: Floats
     """``w_k z_k`` at the cuts, body axes, shape (m + 1, 3), m."""
-    velocity: Floats
-    """v_d at the start of each interval and at its end, body axes, shape (2, m, 3), m/s."""
+    v_start: Floats
+    """v_d at the start of each interval, body axes, shape (m, 3), m/s."""
+    v_end: Floats
+    """The same at its end."""
     origin_ns: int
     """Instant of frame i, one of the cuts; what lies before only shapes s."""
 
@@ -68,29 +70,58 @@ class Sums(NamedTuple):
     """``sum dt a R``, shape (3, 3, 3)."""
 
 
-@compiled
 def sums_along(rows: Rows, imu_rows: int, line: Line, R_0: Floats, bias: Floats, earth: Floats) -> Sums:
     """Sums along a line from the first ``imu_rows`` inertial rows, with the first rotation R_0.
 
     Removed are the gyro bias (body axes) and the Earth's rotation (frame i), rad/s.
     """
-    cuts_ns, imu_ns, m = line.cuts_ns, rows.imu_ns, len(line.W)
-    R_cuts, turned_s, y, r, a = (
-        np.empty((m + 1, 3, 3)),
-        np.zeros((2, m, 3, 3)),
-        np.empty((3, 3)),
-        np.empty((3, 3)),
-        np.empty(3),
+    m = len(line.W)
+    R, turned_s, whole = np.empty((3 * m + 3, 3)), np.empty((6 * m, 3)), np.empty(9)
+    by_y, by_time, by_a = np.zeros((18, 9)), np.zeros((2, 9)), np.zeros((3, 12))
+    _write_sums(rows, imu_rows, *line, R_0, bias, earth, R, turned_s, whole, by_y, by_time, by_a)
+    return Sums(
+        R.reshape(m + 1, 3, 3),
+        whole,
+        turned_s.reshape(2, m, 3, 3),
+        by_y[:9],
+        by_time[0],
+        by_y[9:].reshape(3, 3, 9).transpose(2, 0, 1).reshape(9, 3, 3),
+        by_time[1].reshape(3, 3),
+        by_a[:, 9:],
+        by_a[:, :9].reshape(3, 3, 3),
     )
-    yy, yR, aR = np.zeros((9, 9)), np.zeros((9, 3, 3)), np.zeros((3, 3, 3))
-    y_after, R_after, aa = np.zeros(9), np.zeros((3, 3)), np.zeros((3, 3))
+
+
+@compiled
+def _write_sums(
+    rows: Rows,
+    imu_rows: int,
+    cuts_ns: Ints,
+    is_inertial: bool,
+    W: Floats,
+    jumps: Floats,
+    v_start: Floats,
+    v_end: Floats,
+    origin_ns: int,
+    R_0: Floats,
+    bias: Floats,
+    earth: Floats,
+    R_cuts: Floats,
+    turned_s: Floats,
+    whole: Floats,
+    by_y: Floats,
+    by_time: Floats,
+    by_a: Floats,
+) -> None:
+    """Fill the columns of `Sums`, matrices one below the other (views of arrays are slow to compile)."""
+    imu_ns, m, y, r, a = rows.imu_ns, len(W), np.empty(9), np.empty(9), np.empty(3)
     R, v, p, s, b, E = mat(R_0), ZERO, ZERO, ZERO, vec(bias), vec(earth)
-    t, T = cuts_ns[0], (cuts_ns[m] - line.origin_ns) * 1e-9
+    t, T = cuts_ns[0], (cuts_ns[m] - origin_ns) * 1e-9
     i = rows_until(imu_ns, t)
     for k in range(m):
-        store(R, R_cuts[k], 0, 0)
-        s += R @ vec(line.jumps[k])
-        z, slope, before, after = vec(line.velocity[0, k]), vec(line.velocity[1, k]) - vec(line.velocity[0, k]), O3, O3
+        store(R, R_cuts, 3 * k, 0)
+        s += R @ row(jumps, k)
+        z, slope, before, after = row(v_start, k), row(v_end, k) - row(v_start, k), O3, O3
         while t < cuts_ns[k + 1]:
             until = min(cuts_ns[k + 1], imu_ns[i]) if i < imu_rows else cuts_ns[k + 1]
             middle, dt = t + (until - t) // 2, (until - t) * 1e-9
@@ -103,69 +134,44 @@ def sums_along(rows: Rows, imu_rows: int, line: Line, R_0: Floats, bias: Floats,
             share = (middle - cuts_ns[k]) / (cuts_ns[k + 1] - cuts_ns[k])
             before, after = before + (dt * (1.0 - share)) * R_k, after + (dt * share) * R_k
 
-            h = 1.0 if middle > line.origin_ns else 0.0
-            t_s = h * ((middle - line.origin_ns) * 1e-9)
+            h = 1.0 if middle > origin_ns else 0.0
+            t_s = h * ((middle - origin_ns) * 1e-9)
             F, moment = dt * (R_k @ f), (h * dt**3 / 12.0) * (R_k @ cross(w, f))
-            a[0], a[1], a[2] = h, h * (T - t_s), line.W[k] - t_s if line.is_inertial else 0.0
-            dv, dp = a[0] * F, a[1] * F - moment
-            ds = a[2] * F - moment if line.is_inertial else dt * (R_k @ (z + share * slope))
             bent = (h * dt / 12.0) * F  # mean over the step of what a falling share adds
-            put(v + 0.5 * dv, y, 0)
-            put(p + 0.5 * dp + bent, y, 1)
-            put(s + 0.5 * ds + bent if line.is_inertial else s + 0.5 * ds, y, 2)
-            store(R_k, r, 0, 0)
-            add_moments(
-                dt,
-                h,
-                y.reshape(9),
-                r.reshape(9),
-                a,
-                yy,
-                y_after,
-                yR.reshape(9, 9),
-                R_after.reshape(9),
-                aa,
-                aR.reshape(3, 9),
-            )
+            a[0], a[1], a[2] = h, h * (T - t_s), W[k] - t_s if is_inertial else 0.0
+            dv, dp, ds = a[0] * F, a[1] * F - moment, dt * (R_k @ (z + share * slope))
+            y_s = s + 0.5 * ds
+            if is_inertial:
+                ds = a[2] * F - moment
+                y_s = s + 0.5 * ds + bent
+            nine(v + 0.5 * dv, p + 0.5 * dp + bent, y_s, y)
+            nine(R_k.x, R_k.y, R_k.z, r)
+            for j in range(9):
+                by_time[0, j] += h * dt * y[j]
+                by_time[1, j] += h * dt * r[j]
+                for c in range(9):
+                    by_y[j, c] += dt * y[j] * y[c]
+                    by_y[9 + j, c] += dt * r[j] * y[c]
+            for j in range(3):
+                for c in range(9):
+                    by_a[j, c] += dt * a[j] * r[c]
+                for c in range(3):
+                    by_a[j, 9 + c] += dt * a[j] * a[c]
             v, p, s, R = v + dv, p + dp, s + ds, R @ turn
             i += int(i < imu_rows and imu_ns[i] <= until)
             t = until
-        store(before, turned_s[0, k], 0, 0)
-        store(after, turned_s[1, k], 0, 0)
-    store(R, R_cuts[m], 0, 0)
-    put(v, y, 0)
-    put(p, y, 1)
-    put(s + R @ vec(line.jumps[m]), y, 2)
-    return Sums(R_cuts, y.reshape(9), turned_s, yy, y_after, yR, R_after, aa, aR)
+        store(before, turned_s, 3 * k, 0)
+        store(after, turned_s, 3 * (m + k), 0)
+    store(R, R_cuts, 3 * m, 0)
+    nine(v, p, s + R @ row(jumps, m), whole)
 
 
-@compiled
-def add_moments(
-    dt: float,
-    h: float,
-    y: Floats,
-    R: Floats,
-    a: Floats,
-    yy: Floats,
-    y_after: Floats,
-    yR: Floats,
-    R_after: Floats,
-    aa: Floats,
-    aR: Floats,
-) -> None:
-    """Add a step to the moments of `Sums`."""
-    for j in range(9):
-        dy = dt * y[j]
-        y_after[j] += h * dy
-        R_after[j] += h * dt * R[j]
-        for k in range(9):
-            yy[j, k] += dy * y[k]
-            yR[j, k] += dy * R[k]
-    for j in range(3):
-        for k in range(3):
-            aa[j, k] += dt * a[j] * a[k]
-        for k in range(9):
-            aR[j, k] += dt * a[j] * R[k]
+@inlined
+def nine(a: Vec3, b: Vec3, c: Vec3, out: Floats) -> None:
+    """Write three vectors into an array, one after the other."""
+    out[0], out[1], out[2] = a.x, a.y, a.z
+    out[3], out[4], out[5] = b.x, b.y, b.z
+    out[6], out[7], out[8] = c.x, c.y, c.z
 
 
 CROSS = np.zeros((3, 3, 3))

@@ -399,7 +399,7 @@ class JointPreintegrator:
             jumps = np.zeros((len(cuts_ns), 3))
             jumps[turned] = spans_s[:, None] * velocity[0]
             W, velocity = np.zeros(len(cuts_ns) - 1), np.zeros((2, len(cuts_ns) - 1, 3))
-        line = Line(cuts_ns, rule is None, W, jumps, velocity, int(at_ns[0]))
+        line = Line(cuts_ns, rule is None, W, jumps, velocity[0], velocity[1], int(at_ns[0]))
         sums = sums_along(rows, len(rows.imu_ns), line, np.eye(3), bias, earth)
         errors = spread(sums, sums.whole, T, self.gyro_noise_density, self.accel_noise_density)
         R = sums.R[-1]

@@ -123,15 +123,14 @@ class Odometry:
     def epochs(self, after_ns: int, until_ns: int) -> Ints:
         """Epochs after one instant that are reached at another, in order, shape (n,)."""
         imu_ns, dvl_ns = self._imu.stamps_ns, self._dvl.stamps_ns
-        seen = int(np.searchsorted(imu_ns, until_ns, side="right"))
+        seen = imu_ns.searchsorted(until_ns, side="right")
         if not seen:
             return dvl_ns[:0]
-        first, last = np.searchsorted(dvl_ns, [after_ns, min(until_ns, int(imu_ns[seen - 1]))], side="right")
-        return dvl_ns[first:last]
+        return dvl_ns[dvl_ns.searchsorted(after_ns, side="right") : dvl_ns.searchsorted(imu_ns[seen - 1], side="right")]
 
     def reached_ns(self, epochs_ns: Ints) -> Ints:
         """Instants at which epochs are reached: stamps of the first IMU rows at or after them, shape (n,)."""
-        return self._imu.stamps_ns[np.searchsorted(self._imu.stamps_ns, epochs_ns)]
+        return self._imu.stamps_ns[self._imu.stamps_ns.searchsorted(epochs_ns)]
 
     def is_gap(self, start_ns: int, end_ns: int) -> bool:
         """True for a time without Doppler rows that is too long for a linear velocity."""
@@ -170,6 +169,8 @@ class Odometry:
         if len(epochs_ns):
             first_ns = int(epochs_ns[0])
             head = motion_over(rows, self._sensors, start_ns, first_ns, known_ns, *noise)
+            if first_ns == end_ns:
+                return head
             earth = head.i_T_j.rotation().unrotate(earth)
             return head.then(self._since_epoch(first_ns, end_ns, known_ns, bias, earth))
         before_ns = self.epochs(dvl_ns[0] - 1, end_ns)
@@ -201,7 +202,7 @@ class Odometry:
         return Rows(imu.stamps_ns, *imu.values, dvl.stamps_ns, *dvl.values, self._hold_past, self._turns)
 
     def _is_doppler_stamp(self, instant_ns: int) -> bool:
-        k = np.searchsorted(self._dvl.stamps_ns, instant_ns)
+        k = self._dvl.stamps_ns.searchsorted(instant_ns)
         return bool(k < len(self._dvl.stamps_ns) and self._dvl.stamps_ns[k] == instant_ns)
 
     def _since_epoch(
@@ -210,21 +211,21 @@ class Odometry:
         """Motion from an epoch: final to the newest one, provisional from there on."""
         key, rows, at_ns, motion = (start_ns, bias.tobytes(), earth.tobytes()), self._rows(), start_ns, None
         epochs_ns = self.epochs(start_ns, known_ns)
-        epochs_ns = epochs_ns[epochs_ns <= end_ns]
+        epochs_ns = epochs_ns[: epochs_ns.searchsorted(end_ns, side="right")]
         if len(epochs_ns):
-            if self._final is not None and self._final[0] == key and self._final[1] <= epochs_ns[-1]:
+            newest_ns = int(epochs_ns[-1])
+            if self._final is not None and self._final[0] == key and self._final[1] <= newest_ns:
                 _, at_ns, motion = self._final
-                epochs_ns = epochs_ns[epochs_ns > at_ns]
-            gaps = np.flatnonzero(np.diff(epochs_ns, prepend=at_ns) > self._sensors.longest_ns)
-            marks_ns = np.append(at_ns, epochs_ns)
-            for k in gaps.tolist():
-                lost_ns, found_ns = int(marks_ns[k]), int(marks_ns[k + 1])
-                if at_ns < lost_ns:
-                    motion = self._extended(motion, rows, at_ns, lost_ns, bias, earth)
-                over_gap = bridge(rows, self._sensors, lost_ns, found_ns, True, bias, _in_frame(motion, earth))
-                motion, at_ns = over_gap if motion is None else motion.then(over_gap), found_ns
-            if at_ns < marks_ns[-1]:
-                motion, at_ns = self._extended(motion, rows, at_ns, int(marks_ns[-1]), bias, earth), int(marks_ns[-1])
+            if at_ns < newest_ns:
+                marks_ns = np.concatenate([[at_ns], epochs_ns[epochs_ns.searchsorted(at_ns, side="right") :]])
+                for k in np.flatnonzero(marks_ns[1:] - marks_ns[:-1] > self._sensors.longest_ns).tolist():
+                    lost_ns, found_ns = int(marks_ns[k]), int(marks_ns[k + 1])
+                    if at_ns < lost_ns:
+                        motion = self._extended(motion, rows, at_ns, lost_ns, bias, earth)
+                    over_gap = bridge(rows, self._sensors, lost_ns, found_ns, True, bias, _in_frame(motion, earth))
+                    motion, at_ns = over_gap if motion is None else motion.then(over_gap), found_ns
+                if at_ns < newest_ns:
+                    motion, at_ns = self._extended(motion, rows, at_ns, newest_ns, bias, earth), newest_ns
             assert motion is not None
             self._final = key, at_ns, motion
         if motion is not None and at_ns == end_ns:

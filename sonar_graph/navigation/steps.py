@@ -14,7 +14,7 @@ import numpy as np
 
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.navigation.imu_gaps import UNFELT_NS, Turns, error_in_hole, hole_ns
-from sonar_graph.numerics import ZERO, Mat3, Vec3, inlined, mat, vec
+from sonar_graph.numerics import ZERO, Mat3, Vec3, inlined
 
 
 class Rows(NamedTuple):
@@ -67,15 +67,31 @@ def rows_until(stamps: Ints, instant_ns: int) -> int:
 
 
 @inlined
+def row(A: Floats, k: int) -> Vec3:
+    """Vector from the first three numbers of a row."""
+    return Vec3(A[k, 0], A[k, 1], A[k, 2])
+
+
+@inlined
+def covariance(A: Floats, k: int) -> Mat3:
+    """Matrix k of an array of them."""
+    return Mat3(
+        Vec3(A[k, 0, 0], A[k, 0, 1], A[k, 0, 2]),
+        Vec3(A[k, 1, 0], A[k, 1, 1], A[k, 1, 2]),
+        Vec3(A[k, 2, 0], A[k, 2, 1], A[k, 2, 2]),
+    )
+
+
+@inlined
 def value_at(stamps: Ints, values: Floats, n: int, i: int, t: int, hold_past: bool) -> Vec3:
     """Value at t from the first n rows, where ``stamps[i - 1] < t <= stamps[i]``; outside them the nearest row's."""
     if i >= n:
-        return vec(values[n - 1])
+        return row(values, n - 1)
     if hold_past or i == 0:
-        return vec(values[i])
-    before = vec(values[i - 1])
+        return row(values, i)
+    before = row(values, i - 1)
     share = (t - stamps[i - 1]) / (stamps[i] - stamps[i - 1])
-    return before + share * (vec(values[i]) - before)
+    return before + share * (row(values, i) - before)
 
 
 @inlined
@@ -105,7 +121,7 @@ def step_from(rows: Rows, imu_rows: int, dvl_rows: int, i: int, k: int, t: int, 
         (until - t) * 1e-9,
         value_at(imu_ns, rows.rate, imu_rows, i, middle, hold_past),
         value_at(dvl_ns, rows.velocity, dvl_rows, k, middle, hold_past),
-        interval_s * (0.5 * (mat(rows.cov[last]) + mat(rows.cov[other]))),
+        interval_s * (0.5 * (covariance(rows.cov, last) + covariance(rows.cov, other))),
         f,
         turn_psd,
     )

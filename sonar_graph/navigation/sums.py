@@ -40,7 +40,6 @@ from sonar_graph.numerics import (
 NOWHERE = Vec3(np.nan, np.nan, np.nan)
 
 
-@compiled
 def motions_over(
     rows: Rows,
     start_ns: Ints,
@@ -57,9 +56,32 @@ def motions_over(
     Removed are the gyro bias (body frame) and the Earth's rotation (frame i), rad/s. An interval with more than
     ``longest_ns`` between Doppler samples is all NaN.
     """
+    n = len(start_ns)
+    out = np.empty((3 * n, 3)), np.empty((n, 3)), np.empty((6 * n, 6)), np.empty((6 * n, 3)), np.empty((n, 3))
+    _write_motions(rows, start_ns, end_ns, known_ns, longest_ns, bias, earth, body_p_dvl, gyro_density, *out)
+    dR, dp, C, D, impulse = out
+    return Motions(dR.reshape(n, 3, 3), dp, C.reshape(n, 6, 6), D.reshape(n, 6, 3), impulse)
+
+
+@compiled
+def _write_motions(
+    rows: Rows,
+    start_ns: Ints,
+    end_ns: Ints,
+    known_ns: Ints,
+    longest_ns: int,
+    bias: Floats,
+    earth: Floats,
+    body_p_dvl: Floats,
+    gyro_density: float,
+    dR: Floats,
+    dp: Floats,
+    C: Floats,
+    D: Floats,
+    impulse: Floats,
+) -> None:
+    """Fill the columns of `Motions`, their matrices one below the other (reshaping is slow to compile)."""
     n, b, E, arm = len(start_ns), vec(bias), vec(earth), vec(body_p_dvl)
-    dR, dp, impulse = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3))
-    C, D = np.empty((n, 6, 6)), np.empty((n, 6, 3))
     for e in range(n):
         t, end = start_ns[e], end_ns[e]
         i, k = rows_until(rows.imu_ns, t), rows_until(rows.dvl_ns, t)
@@ -85,10 +107,9 @@ def motions_over(
             p, R = p + s, R @ turn
         to_j = inverse_adjoint(R, p)
         D_j = to_j @ Mat6(D_t, O3, D_r, O3)
-        store(R, dR[e], 0, 0)
+        store(R, dR, 3 * e, 0)
         put(p, dp, e)
         put(f, impulse, e)
-        store6(to_j @ Mat6(tt, rt.T, rt, rr) @ to_j.T, C[e])
-        store(D_j.a, D[e], 0, 0)
-        store(D_j.c, D[e], 3, 0)
-    return Motions(dR, dp, C, D, impulse)
+        store6(to_j @ Mat6(tt, rt.T, rt, rr) @ to_j.T, C, 6 * e)
+        store(D_j.a, D, 6 * e, 0)
+        store(D_j.c, D, 6 * e + 3, 0)

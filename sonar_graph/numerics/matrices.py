@@ -205,12 +205,12 @@ def store(A: Mat3, out: Floats, row: int, column: int) -> None:
 
 
 @inlined
-def store6(A: Mat6, out: Floats) -> None:
-    """Write a symmetric matrix into the first six rows and columns of an array, symmetric to the last bit."""
-    store(0.5 * (A.a + A.a.T), out, 0, 0)
-    store(A.c.T, out, 0, 3)
-    store(A.c, out, 3, 0)
-    store(0.5 * (A.d + A.d.T), out, 3, 3)
+def store6(A: Mat6, out: Floats, row: int = 0) -> None:
+    """Write a symmetric matrix into the first six columns of an array from a row on, symmetric to the last bit."""
+    store(0.5 * (A.a + A.a.T), out, row, 0)
+    store(A.c.T, out, row, 3)
+    store(A.c, out, row + 3, 0)
+    store(0.5 * (A.d + A.d.T), out, row + 3, 3)
 
 
 @inlined
