@@ -350,7 +350,7 @@ class Smoother:
         return True
 
     def _take(self, estimate: gtsam.Values) -> None:
-        """The window's; a bounded one forgets what has left."""
+        """Take over the estimate of the window; a bounded one forgets what has left."""
         self._solved = None  # who asked before must not decide where the next solution starts
         if not self.is_bounded:
             self.values.update(estimate)
