@@ -221,6 +221,8 @@ def test_a_landmark_has_to_be_denser_than_what_is_not_in_the_map(range_m: float,
     policied, _ = anonymous(range_m, share * density / (ODDS * z[0]))
     (paired,) = policied.pair(view, z[None], NOISE[None], set())
     assert paired.landmark_id == (7 if share < 1.0 else None)
+    (named,) = policied.pair(view, z[None], NOISE[None], {7})
+    assert named.landmark_id is None, "the landmark is named elsewhere in the frame"
 
 
 @pytest.mark.parametrize("range_m", [0.5, 2.0, 8.0])
