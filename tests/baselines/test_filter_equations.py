@@ -181,8 +181,8 @@ def test_depth_up_and_plane_are_scalar_kalman_updates_where_nothing_correlates(f
 
 def test_a_correction_keeps_roll_and_yaw_within_half_a_turn():
     x, P = np.array([0.0, 0.0, 0.0, 3.1, 0.0, -3.1]), np.eye(6)
-    ekf_equations.correct_number(x, P, 3, 3.3, 1.0)
-    ekf_equations.correct_number(x, P, 5, -3.3, 1.0)
+    ekf_equations.correct_number(x, P, 3, 3.3 - 2 * np.pi, 1.0)
+    ekf_equations.correct_number(x, P, 5, -3.3 + 2 * np.pi, 1.0)
     assert x[[3, 5]] == pytest.approx([3.2 - 2 * np.pi, -3.2 + 2 * np.pi])
 
 
