@@ -8,7 +8,8 @@ measured at an instant is related to the newest epoch reached by then, through a
           i -------- t           depth sample, frame, or estimate at the end of the call
 
 Measurements that are related to one epoch over the same gap of the Doppler log share its error. The k-th gets k (k + 1)
-times the motion's covariance: together they tell no more than one exact measurement, ``sum 1 / (k (k + 1)) = 1``.
+times the motion's covariance: together those of one kind, depths or detections, tell no more than one exact
+measurement, ``sum 1 / (k (k + 1)) = 1``.
 
 Far landmarks (`far_view`) and the choices that the paper leaves open: docs/theory/ekf_slam.md, docs/theory/gaps.md.
 """

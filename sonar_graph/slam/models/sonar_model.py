@@ -178,7 +178,7 @@ def elevation_on_floor(
     a, b, c = world_T_sonar.rotation().matrix()[2].tolist()
     level = a * math.cos(azimuth_rad) + b * math.sin(azimuth_rad)
     reach_m, height_m = range_m * math.hypot(level, c), floor_z_m - world_T_sonar.z()
-    if reach_m <= 0.0 or abs(height_m) > reach_m:
+    if reach_m <= 0.0 or not abs(height_m) <= reach_m:  # NaN where the floor's height is not known
         return None
     middle, half = math.atan2(c, level), math.acos(height_m / reach_m)
     nearest = min(wrap_angle(middle + half), wrap_angle(middle - half), key=abs)
