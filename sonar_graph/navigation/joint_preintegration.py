@@ -405,9 +405,10 @@ class JointPreintegrator:
         R = sums.R[-1]
         if rule is None:
             weights = w[:, None, None] * sums.R
-            swung_s = np.tensordot(by_rate_s, sums.R, 1)
-            sums.whole[6:] += np.cross(earth, swung_s @ arm)
-            errors.D_gyro[6:] -= swung_s @ hat(arm)
+            if by_rate_s.any():
+                swung_s = np.tensordot(by_rate_s, sums.R, 1)
+                sums.whole[6:] += np.cross(earth, swung_s @ arm)
+                errors.D_gyro[6:] -= swung_s @ hat(arm)
         else:
             if rule.turned_at is None:
                 whole, rising = sums.turned_s.sum(axis=0), sums.turned_s[1]
