@@ -138,7 +138,7 @@ def _write_sums(
             t_s = h * ((middle - origin_ns) * 1e-9)
             F, moment = dt * (R_k @ f), (h * dt**3 / 12.0) * (R_k @ cross(w, f))
             bent = (h * dt / 12.0) * F  # mean over the step of what a falling share adds
-            a[0], a[1], a[2] = h, h * (T - t_s), W[k] - t_s if is_inertial else 0.0
+            a[0], a[1], a[2] = h, T - t_s, W[k] - t_s if is_inertial else 0.0
             dv, dp, ds = a[0] * F, a[1] * F - moment, dt * (R_k @ (z + share * slope))
             y_s = s + 0.5 * ds
             if is_inertial:

@@ -256,6 +256,8 @@ def test_a_hole_is_longer_than_five_typical_intervals_and_a_twentieth_of_a_secon
         ns = T0_NS + interval_ms * MS * np.arange(12)
         assert hole_ns(np.append(ns, ns[-1] + longest_ms * MS), 13, 12, 0) == 0
         assert hole_ns(np.append(ns, ns[-1] + hole_ms * MS), 13, 12, 0) == hole_ms * MS
+    uneven = T0_NS + MS * np.cumsum([0, 10, 50, 10, 50, 120])
+    assert hole_ns(uneven, 6, 5, 0) == 120 * MS  # where half of those before are shorter than a fifth
 
 
 def test_an_open_hole_lasts_from_the_last_known_row():
