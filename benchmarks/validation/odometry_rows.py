@@ -49,7 +49,6 @@ from sonar_graph.navigation.alignment import (
     gravity_direction,
     match_dvl_to_imu,
     match_reference_to_imu,
-    velocity_at_imu,
 )
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import BasinOptions, simulate_basin
@@ -126,10 +125,9 @@ def gravity(sequence: Sequence, n: int, motion: JointMotion) -> gtsam.NonlinearF
     """The direction of gravity at the end of motion n."""
     calibration, rows = sequence.calibration, np.searchsorted(sequence.dvl.stamps_ns, [motion.start_ns, motion.end_ns])
     imu, log = calibration.imu.mounting.pose(), calibration.dvl.mounting.pose()
-    at_imu = [
-        velocity_at_imu(log.rotation().matrix() @ z, imu.rotation().matrix() @ w, log.translation(), imu.translation())
-        for z, w in zip(sequence.dvl.velocity[rows], rates_at(sequence, sequence.dvl.stamps_ns[rows]), strict=True)
-    ]
+    rates = rates_at(sequence, sequence.dvl.stamps_ns[rows]) @ imu.rotation().matrix().T
+    at_imu = sequence.dvl.velocity[rows] @ log.rotation().matrix().T
+    at_imu = at_imu + np.cross(rates, imu.translation() - log.translation())
     sigma = float(np.sqrt(np.mean(np.square(calibration.dvl.velocity_sigma_m_s))))
     told = gravity_direction(motion.relative_pose(), *at_imu, sigma, calibration.imu, calibration.gravity_m_s2)
     assert told is not None
