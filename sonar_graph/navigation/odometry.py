@@ -69,6 +69,7 @@ class Odometry:
         self._turns = UNTURNED if self._hold_past else turns_of(calibration.imu)
         self._sensors = Sensors.of(calibration)
         self._earth = earth_rate_in_world(calibration)
+        self._dvl_p_imu = (self._sensors.body_p_imu - self._sensors.body_p_dvl).tolist()
         self._final: tuple[tuple[int, bytes, bytes], int, PreintegratedMotion] | None = None
 
     @property
@@ -189,13 +190,14 @@ class Odometry:
         """Velocity of the IMU's point at an epoch, body axes, shape (3,), m/s, and the variance of one component."""
         if not self._is_doppler_stamp(epoch_ns):
             raise no_doppler_stamp("epoch_ns", epoch_ns, self._dvl.stamps_ns)
-        k, i = (int(np.searchsorted(stamps, epoch_ns)) for stamps in (self._dvl.stamps_ns, self._imu.stamps_ns))
+        k, i = (int(stamps.searchsorted(epoch_ns)) for stamps in (self._dvl.stamps_ns, self._imu.stamps_ns))
         (velocity, cov), (rates, _), imu_ns = self._dvl.values, self._imu.values, self._imu.stamps_ns
         rate = rates[min(i, len(rates) - 1)]
         if 0 < i < len(rates) and not self._hold_past:
             rate = rates[i - 1] + (epoch_ns - imu_ns[i - 1]) / (imu_ns[i] - imu_ns[i - 1]) * (rates[i] - rates[i - 1])
-        dvl_p_imu = self._sensors.body_p_imu - self._sensors.body_p_dvl
-        return velocity[k] + np.cross(rate, dvl_p_imu), float(np.trace(cov[k])) / 3.0
+        (x, y, z), (a, b, c) = rate.tolist(), self._dvl_p_imu
+        swing = y * c - z * b, z * a - x * c, x * b - y * a
+        return velocity[k] + swing, float(cov[k, 0, 0] + cov[k, 1, 1] + cov[k, 2, 2]) / 3.0
 
     def _rows(self) -> Rows:
         imu, dvl = self._imu, self._dvl

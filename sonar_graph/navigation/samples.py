@@ -155,7 +155,6 @@ def longest_interval_ns(calibration: Calibration) -> int:
     return LATEST_NS if calibration.odometry_interpolation == "hold-past" else round(calibration.dvl.gap_s * 1e9)
 
 
-@compiled
 def in_numbers(velocity_cov: Floats, unsaid: Floats) -> Floats:
     """Covariances of shape (n, 3, 3) without NaN and infinity.
 
@@ -168,23 +167,14 @@ def in_numbers(velocity_cov: Floats, unsaid: Floats) -> Floats:
     -------
     The same, with `UNMEASURED_M_S` and no correlation along axes whose variance is infinite.
     """
-    numbers = np.empty(velocity_cov.shape)
-    for k in range(len(numbers)):
-        said = velocity_cov[k]
-        for i in range(3):
-            for j in range(3):
-                if np.isinf(said[i, i]) or np.isinf(said[j, j]):
-                    numbers[k, i, j] = UNMEASURED_M_S**2 if i == j else 0.0
-                else:
-                    numbers[k, i, j] = unsaid[i, j] if np.isnan(said[i, j]) else said[i, j]
-    return numbers
+    if np.isfinite(velocity_cov).all():
+        return velocity_cov
+    infinite = np.isinf(velocity_cov.diagonal(axis1=1, axis2=2))
+    unmeasured = infinite[:, :, None] | infinite[:, None, :]
+    numbers = np.where(np.isnan(velocity_cov), unsaid, velocity_cov)
+    return np.where(unmeasured, UNMEASURED_M_S**2 * np.eye(3), numbers)
 
 
-@compiled
 def is_partial(velocity_cov: Floats) -> NDArray[np.bool_]:
     """True for covariances of shape (n, 3, 3) with an unmeasured direction, shape (n,)."""
-    partial = np.empty(len(velocity_cov), np.bool_)
-    for k in range(len(partial)):
-        cov = velocity_cov[k]
-        partial[k] = cov[0, 0] + cov[1, 1] + cov[2, 2] > 0.5 * UNMEASURED_M_S**2
-    return partial
+    return np.asarray(velocity_cov.diagonal(axis1=1, axis2=2).sum(axis=1) > 0.5 * UNMEASURED_M_S**2)

@@ -159,7 +159,7 @@ class VelocityConfirmation:
     def accept(self, whole_ns: Ints) -> None:
         """Take note of whole rows that the gate accepted."""
         if len(whole_ns):
-            self._recent_ns = np.union1d(self._recent_ns, whole_ns[-RECENT:]).astype(np.int64).tolist()[-RECENT:]
+            self._recent_ns = sorted({*self._recent_ns, *whole_ns[-RECENT:].tolist()})[-RECENT:]
 
     def confirm(self, stamp_ns: int, velocity: Floats, cov: Floats, *, is_partial: bool) -> Confirmed:
         """Take in one row; return those, of it and the waiting ones, that may go on."""

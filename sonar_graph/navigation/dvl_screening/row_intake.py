@@ -9,6 +9,7 @@ until it can be completed (`sonar_graph.navigation.dvl_screening.partial_beams`)
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sonar_graph.calibration import Calibration, Mounting
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints
@@ -80,15 +81,13 @@ class RowIntake:
         if rows is None:
             return False
         cov = in_numbers(rows.velocity_cov, self._default_cov)
-        if not np.isnan(rows.velocity_cov).all():
-            variances = np.linalg.eigvalsh(cov)
-            is_sound = (variances[:, 0] > ROUNDING * variances[:, 2]) | np.isnan(rows.velocity_cov).all(axis=(1, 2))
-            if not is_sound.all():
-                unsound = rows.stamps_ns[~is_sound].tolist()
-                self._refused += [RefusedRow("dvl", stamp_ns, Refusal.UNSOUND, np.nan) for stamp_ns in unsound]
-                if not is_sound.any():
-                    return False
-                rows, cov = rows.rows(is_sound), cov[is_sound]
+        is_sound = _positive_definite(cov) | np.isnan(rows.velocity_cov[:, 0, 0])
+        if not is_sound.all():
+            unsound = rows.stamps_ns[~is_sound].tolist()
+            self._refused += [RefusedRow("dvl", stamp_ns, Refusal.UNSOUND, np.nan) for stamp_ns in unsound]
+            if not is_sound.any():
+                return False
+            rows, cov = rows.rows(is_sound), cov[is_sound]
         velocity = rows.velocity
         if self._body_R_dvl is not None:
             velocity, cov = velocity @ self._body_R_dvl.T, self._body_R_dvl @ cov @ self._body_R_dvl.T
@@ -140,6 +139,14 @@ class RowIntake:
         if (rows.stamps_ns[1:] == rows.stamps_ns[:-1]).any():
             rows = rows.rows(np.unique(rows.stamps_ns, return_index=True)[1])
         return rows
+
+
+def _positive_definite(cov: Floats) -> NDArray[np.bool_]:
+    """Mask of positive definite matrices (n, 3, 3), at once where each diagonal exceeds the rest of its row."""
+    if (np.abs(cov).sum(axis=2) < 2.0 * cov.diagonal(axis1=1, axis2=2)).all():
+        return np.ones(len(cov), np.bool_)
+    variances = np.linalg.eigvalsh(cov)
+    return np.asarray(variances[:, 0] > ROUNDING * variances[:, 2])
 
 
 def _rotation(mounting: Mounting) -> Floats | None:
