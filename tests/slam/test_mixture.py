@@ -12,8 +12,14 @@ from scipy.stats import multivariate_normal
 from sonar_graph.measurements import Floats
 from sonar_graph.slam import GaussianKernel, RobustKernel
 from sonar_graph.slam.landmarks import mixture
-from sonar_graph.slam.landmarks.association import IdentityPosterior, RecogniserErrors
-from sonar_graph.slam.landmarks.mixture import REPEATED_LOSS, Errors, Mixture, TrackedObject
+from sonar_graph.slam.landmarks.mixture import (
+    REPEATED_LOSS,
+    Errors,
+    IdentityPosterior,
+    Mixture,
+    RecogniserErrors,
+    TrackedObject,
+)
 from sonar_graph.slam.landmarks.sighting import Sighting
 from sonar_graph.slam.models import Kernel, factors
 from sonar_graph.slam.smoother.batch_solution import Sightline

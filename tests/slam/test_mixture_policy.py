@@ -14,9 +14,8 @@ from sonar_graph.measurements import Floats
 from sonar_graph.slam import GaussianKernel, KeyframeParams, MixtureIdentity, RobustIdentity, RobustKernel
 from sonar_graph.slam.landmarks import mixture
 from sonar_graph.slam.landmarks import mixture_policy as doubtful_identities
-from sonar_graph.slam.landmarks.association import IdentityPosterior, RecogniserErrors
 from sonar_graph.slam.landmarks.landmark_graph import Assignment, LandmarkGraph
-from sonar_graph.slam.landmarks.mixture import Choices, Mixture, TrackedObject
+from sonar_graph.slam.landmarks.mixture import Choices, IdentityPosterior, Mixture, RecogniserErrors, TrackedObject
 from sonar_graph.slam.landmarks.mixture_policy import MixtureIdentities
 from sonar_graph.slam.landmarks.sighting import Sighting, SightingFactors
 from sonar_graph.slam.models import Kernel

@@ -1,6 +1,6 @@
 """Identities of detections: what is believed, gated, taken back or chosen anew (docs/theory/doubtful_identities.md).
 
-association.py       the recogniser's posterior, accepted above a least probability or weighed for the mixture
+association.py       the recogniser's posterior, accepted above a least probability
 sighting.py          a frame's detections tied to a keyframe, and their factors
 landmark_graph.py    the life of a detection, and its one writer: which sightings are of which landmark
 tracked.py           policies "robust" (default) and "gate": a wrong identity is taken back when its track is renamed

@@ -12,8 +12,19 @@ with the kernel's loss rho, and n normalising ``n^2 / sqrt(det R) exp(-rho)``. C
 landmark that began in a wrong place fits none of its own sightings, and nothing moves it. So the objects that name it
 vote on its place, ``vote(p) = sum of max(l_i(p), l_none)``, at the point where it is and where each sighting that does
 not fit has it (docs/theory/doubtful_identities.md).
+
+Weights: a recogniser states a posterior p over landmarks; what is missing to 1 is no landmark. With the probability q
+that the statement has nothing to do with what was seen, K landmarks in the graph, and half of the errors being no
+landmark, no weight is zero::
+
+    w_i = (1 - q) p_i + q / (2 K),      w_none = (1 - q) (1 - sum p) + q / 2
+
+A detection of no landmark may be anywhere in view, with the density u over range and azimuth, 1/(m rad).
 """
 
+from __future__ import annotations
+
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
@@ -21,14 +32,67 @@ from itertools import accumulate
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import L
+from pydantic import Field
 
-from sonar_graph.measurements import Floats
-from sonar_graph.slam.landmarks.association import IdentityPosterior, RecogniserErrors
+from sonar_graph.calibration import Section
+from sonar_graph.measurements import Floats, LandmarkDetections
 from sonar_graph.slam.landmarks.sighting import Sighting
 from sonar_graph.slam.models import Kernel
 
 REPEATED_LOSS = 3.0
 """Mean loss, twice or thrice what noise alone gives, to which sightings of one thing that stands still agree."""
+
+
+LEAST_LANDMARKS = 20
+"""Least K: while the graph has few landmarks, a mistaken name is more probably of one that is not in it yet."""
+
+
+class RecogniserErrors(Section):
+    """Error rate of a recogniser, and the view over which detections of no landmark are spread."""
+
+    wrong_id_probability: float = Field(0.05, gt=0, lt=1)
+    """Probability q that the recogniser's statement has nothing to do with the object seen; errors that its posterior
+    admits come on top. One half of q is shared by the landmarks of the graph, the other half means: no landmark."""
+    view_range_m: float = Field(10.0, gt=0)
+    """Width of the interval of range over which detections of no landmark are taken as evenly distributed."""
+    view_azimuth_rad: float = Field(2.0, gt=0)
+    """Width of the interval of azimuth over which detections of no landmark are taken as evenly distributed."""
+
+    @property
+    def log_density(self) -> float:
+        """Logarithm of u."""
+        return -math.log(self.view_range_m * self.view_azimuth_rad)
+
+
+@dataclass(frozen=True)
+class IdentityPosterior:
+    """Posterior that a recogniser stated for one detection, or last for a track."""
+
+    probability: dict[int, float]
+    """Posterior of each landmark considered; 0 for all others."""
+
+    @classmethod
+    def of(cls, frame: LandmarkDetections, row: int) -> IdentityPosterior:
+        """Posterior of a row; NaN counts as 0, and a sum above 1 is normalised to 1."""
+        stated: dict[int, float] = {}
+        for landmark_id, p in zip(frame.candidate_ids[row].tolist(), frame.id_probability[row].tolist(), strict=True):
+            if landmark_id >= 0 and p > 0:
+                stated[landmark_id] = stated.get(landmark_id, 0.0) + p
+        return cls({landmark_id: p / max(sum(stated.values()), 1.0) for landmark_id, p in stated.items()})
+
+    @property
+    def favourite(self) -> int | None:
+        """Landmark more probable than all else together, or None."""
+        return next((landmark_id for landmark_id, p in self.probability.items() if p > 0.5), None)
+
+    def log_weights(self, ids: list[int], errors: RecogniserErrors) -> Floats:
+        """Logarithms of w for K landmarks and for none, shape (K + 1,)."""
+        q, p = errors.wrong_id_probability, self.probability
+        none = (1.0 - q) * (1.0 - min(sum(p.values()), 1.0)) + 0.5 * q
+        share = 0.5 * q / max(len(ids), LEAST_LANDMARKS)
+        weights = np.array([(1.0 - q) * p.get(landmark_id, 0.0) + share for landmark_id in ids] + [none])
+        with np.errstate(divide="ignore"):
+            return np.asarray(np.log(weights))
 
 
 @dataclass(eq=False)

@@ -22,11 +22,19 @@ from pydantic import Field
 
 from sonar_graph.measurements import NO_TRACK, LandmarkDetections
 from sonar_graph.slam.estimates import Solution
-from sonar_graph.slam.landmarks.association import IdentityPosterior, RecogniserErrors, second_rows_of_tracks
 from sonar_graph.slam.landmarks.landmark_graph import Assignment, LandmarkGraph
-from sonar_graph.slam.landmarks.mixture import Choices, Mixture, Scores, TrackedObject, each_once, supporters_elsewhere
+from sonar_graph.slam.landmarks.mixture import (
+    Choices,
+    IdentityPosterior,
+    Mixture,
+    RecogniserErrors,
+    Scores,
+    TrackedObject,
+    each_once,
+    supporters_elsewhere,
+)
 from sonar_graph.slam.landmarks.sighting import SeenFrame, Sighting, late_view
-from sonar_graph.slam.landmarks.tracked import NS_PER_S, GatedIdentity, RobustIdentity
+from sonar_graph.slam.landmarks.tracked import NS_PER_S, GatedIdentity, RobustIdentity, second_rows_of_tracks
 from sonar_graph.slam.models import Kernel
 from sonar_graph.slam.smoother import marginals_of, solve_in_sight
 from sonar_graph.states import Outcome

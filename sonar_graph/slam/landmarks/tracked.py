@@ -6,7 +6,7 @@ the graph; those of the other landmark are put in once the estimate no longer re
 """
 
 import math
-from collections.abc import Iterator, Set
+from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -17,18 +17,48 @@ from pydantic import Field
 from sonar_graph.calibration import Section
 from sonar_graph.measurements import NO_TRACK, LandmarkDetections
 from sonar_graph.slam.estimates import Solution
-from sonar_graph.slam.landmarks.association import (
-    NO_LANDMARK,
-    UNDECIDED,
-    decide,
-    gate_threshold,
-    identify,
-    second_rows_of_tracks,
-)
+from sonar_graph.slam.landmarks.association import gate_threshold, identify
 from sonar_graph.slam.landmarks.landmark_graph import Assignment, LandmarkGraph
 from sonar_graph.slam.landmarks.sighting import SeenFrame, Sighting, beam_point, late_view
 from sonar_graph.slam.landmarks.unknown import IgnoredUnknown, NamelessLandmarks, UnknownParams, unnamed
 from sonar_graph.states import Outcome
+
+UNDECIDED, NO_LANDMARK = -2, -1
+"""Decisions of a row besides a landmark's identity."""
+
+
+def decide(frame: LandmarkDetections, least_probability: float) -> list[int]:
+    """Decision of each row: a landmark's identity, `NO_LANDMARK` or `UNDECIDED`."""
+    ids, probability = frame.most_probable()
+    none = 1.0 - frame.id_probability.sum(axis=1)
+    return [
+        landmark_id
+        if p >= least_probability and landmark_id >= 0
+        else (NO_LANDMARK if missing >= least_probability else UNDECIDED)
+        for landmark_id, p, missing in zip(ids.tolist(), probability.tolist(), none.tolist(), strict=True)
+    ]
+
+
+def second_rows_of_tracks(frame: LandmarkDetections, identities: Mapping[int, int]) -> list[Outcome | None]:
+    """Refusals of the rows of a frame that show an object a second time; None: the row stays.
+
+    A track is one object in one place, so each frame keeps one row of it: that with the highest posterior for the
+    landmark that the track counts as, by its number; of others, the one with the highest posterior for any landmark; of
+    equals the first.
+    """
+    tracks = frame.track.tolist()
+    best: dict[int, tuple[float, float, int]] = {}
+    for row, track in enumerate(tracks):
+        if track != NO_TRACK:
+            is_landmark = frame.candidate_ids[row] >= 0
+            ids, posterior = frame.candidate_ids[row, is_landmark], frame.id_probability[row, is_landmark]
+            of_it = float(posterior[ids == identities.get(track, UNDECIDED)].sum())
+            score = of_it, float(posterior.max(initial=0.0)), -row
+            best[track] = max(best.get(track, score), score)
+    return [
+        None if track == NO_TRACK or -best[track][2] == row else Outcome.TRACK_REPEATED
+        for row, track in enumerate(tracks)
+    ]
 
 
 class TrackedIdentity(Section):
