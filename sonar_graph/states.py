@@ -6,7 +6,6 @@ import math
 import reprlib
 from array import array
 from collections import Counter
-from copy import deepcopy
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
@@ -287,45 +286,10 @@ class DetectionJournal:
         """
         self._stamps_ns.append(stamp_ns)
         self._ids.append(landmark_id)
-        self._outcomes.append(_NUMBER[outcome])
-        self._innovations.extend(_UNKNOWN[:2] if innovation is None else innovation.tolist())
-        self._innovation_covs.extend(_UNKNOWN if innovation_cov is None else innovation_cov.ravel().tolist())
+        self._outcomes.append(OUTCOME_NUMBERS[outcome])
+        self._innovations.extend(UNKNOWN[:2] if innovation is None else innovation.tolist())
+        self._innovation_covs.extend(UNKNOWN if innovation_cov is None else innovation_cov.ravel().tolist())
         return self._forgotten + len(self) - 1
-
-    def forget_before(self, stamp_ns: int) -> None:
-        """Drop rows until the first that is not older than ``stamp_ns``; the others keep their numbers."""
-        count = 0
-        while count < len(self) and self._stamps_ns[count] < stamp_ns:
-            count += 1
-        del self._stamps_ns[:count], self._ids[:count], self._outcomes[:count]
-        del self._innovations[: 2 * count], self._innovation_covs[: 4 * count]
-        self._forgotten += count
-
-    def copy(self) -> DetectionJournal:
-        """Independent copy."""
-        return deepcopy(self)
-
-    def amend(
-        self,
-        row: int,
-        outcome: Outcome,
-        landmark_id: int | None = None,
-        innovation: Floats | None = None,
-        innovation_cov: Floats | None = None,
-    ) -> None:
-        """Change the outcome of a row, and its landmark unless None; innovation and covariance as in `record`.
-
-        An earlier innovation is dropped: it was against the landmark that the detection was first taken for.
-        """
-        row -= self._forgotten
-        if row < 0:
-            return
-        self._outcomes[row] = _NUMBER[outcome]
-        self._ids[row] = self._ids[row] if landmark_id is None else landmark_id
-        e = _UNKNOWN[:2] if innovation is None else innovation.tolist()
-        S = _UNKNOWN if innovation_cov is None else innovation_cov.ravel().tolist()
-        self._innovations[2 * row : 2 * row + 2] = array("d", e)
-        self._innovation_covs[4 * row : 4 * row + 4] = array("d", S)
 
     def log(self) -> DetectionLog:
         """Rows that are not forgotten."""
@@ -340,5 +304,5 @@ class DetectionJournal:
 
 
 _OUTCOMES = list(Outcome)
-_NUMBER = {outcome: number for number, outcome in enumerate(_OUTCOMES)}
-_UNKNOWN = (math.nan,) * 4
+OUTCOME_NUMBERS = {outcome: number for number, outcome in enumerate(_OUTCOMES)}
+UNKNOWN = (math.nan,) * 4

@@ -145,7 +145,6 @@ extending.overload_attribute(types.NamedUniTuple, "T", jit_options=INLINE, stric
 ZERO = Vec3(0.0, 0.0, 0.0)
 O3 = Mat3(ZERO, ZERO, ZERO)
 I3 = Mat3(Vec3(1.0, 0.0, 0.0), Vec3(0.0, 1.0, 0.0), Vec3(0.0, 0.0, 1.0))
-O6 = Mat6(O3, O3, O3, O3)
 
 
 @inlined
@@ -211,12 +210,6 @@ def store6(A: Mat6, out: Floats, row: int = 0) -> None:
     store(A.c.T, out, row, 3)
     store(A.c, out, row + 3, 0)
     store(0.5 * (A.d + A.d.T), out, row + 3, 3)
-
-
-@inlined
-def adjoint(R: Mat3, p: Vec3) -> Mat6:
-    """Ad of a pose, on [rotation, translation]: ``[[R, 0], [[p]x R, R]]``."""
-    return Mat6(R, O3, skew(p) @ R, R)
 
 
 @inlined

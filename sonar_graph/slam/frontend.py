@@ -15,6 +15,7 @@ from sonar_graph.measurements import NO_TRACK, LandmarkDetections
 from sonar_graph.slam.estimates import Solution
 from sonar_graph.slam.keyframes import Keyframes, sound_detections
 from sonar_graph.slam.landmarks import (
+    AmendableJournal,
     AssociatedUnknown,
     IdentityParams,
     IdentityPolicy,
@@ -28,14 +29,14 @@ from sonar_graph.slam.landmarks import (
 )
 from sonar_graph.slam.models import KernelParams
 from sonar_graph.slam.smoother import Changed
-from sonar_graph.states import DetectionJournal, DetectionLog, Outcome
+from sonar_graph.states import DetectionLog, Outcome
 
 
 class Frontend:
     """Adds the factors of detected landmarks to a smoother and records what became of each detection."""
 
     def __init__(self, identity: IdentityParams, kernel: KernelParams, keyframes: Keyframes) -> None:
-        self.journal = DetectionJournal()
+        self.journal = AmendableJournal()
         self._keyframes = keyframes
         factors = SightingFactors(keyframes.calibration.sonar, kernel.robust)
         self.landmarks = LandmarkGraph(keyframes.smoother, factors, self.journal)

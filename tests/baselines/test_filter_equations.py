@@ -11,7 +11,7 @@ from baselines import ekf_equations, invariant_equations
 from baselines.filter import SonarModel, correction
 from sonar_graph.calibration import DepthCalibration, PlanarMotion, Start
 from sonar_graph.navigation import Odometry
-from sonar_graph.slam.models.sonar_model import locate, range_azimuth
+from sonar_graph.slam.models.views import locate, range_azimuth
 from sonar_graph.testing import check_derivative
 from sonar_graph.testing.numerical import central_differences
 

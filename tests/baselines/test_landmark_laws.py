@@ -15,7 +15,8 @@ from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 from sonar_graph.slam.landmarks.association import gate_threshold
-from sonar_graph.slam.models.sonar_model import FLOOR_GATE, elevation_on_floor, locate, range_azimuth
+from sonar_graph.slam.models.sonar_model import FLOOR_GATE, elevation_on_floor
+from sonar_graph.slam.models.views import locate, range_azimuth
 from sonar_graph.testing.numerical import central_differences
 
 from .filters import (

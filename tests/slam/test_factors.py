@@ -17,7 +17,7 @@ from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation.joint_preintegration import JointMotion, JointPreintegrator
 from sonar_graph.slam.models import factors
 from sonar_graph.slam.models.inertial_factors import doppler_odometry, inertial_doppler_odometry
-from sonar_graph.slam.models.sonar_model import range_azimuth
+from sonar_graph.slam.models.views import range_azimuth
 from sonar_graph.testing import check_consistent, check_jacobians
 
 from .graphs import information

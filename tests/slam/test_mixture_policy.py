@@ -14,13 +14,13 @@ from sonar_graph.measurements import Floats
 from sonar_graph.slam import GaussianKernel, KeyframeParams, MixtureIdentity, RobustIdentity, RobustKernel
 from sonar_graph.slam.landmarks import mixture
 from sonar_graph.slam.landmarks import mixture_policy as doubtful_identities
-from sonar_graph.slam.landmarks.landmark_graph import Assignment, LandmarkGraph
+from sonar_graph.slam.landmarks.landmark_graph import AmendableJournal, Assignment, LandmarkGraph
 from sonar_graph.slam.landmarks.mixture import Choices, IdentityPosterior, Mixture, RecogniserErrors, TrackedObject
 from sonar_graph.slam.landmarks.mixture_policy import MixtureIdentities
 from sonar_graph.slam.landmarks.sighting import Sighting, SightingFactors
 from sonar_graph.slam.models import Kernel
 from sonar_graph.slam.smoother.batch_solution import Sightline
-from sonar_graph.states import DetectionJournal, Outcome
+from sonar_graph.states import Outcome
 
 from . import dive as dive_module
 from . import test_mixture as small
@@ -298,7 +298,7 @@ def test_a_detection_of_a_known_track_gets_its_landmark_also_where_another_is_ne
     assert world.sightings.journal.log().landmark_ids.tolist() == [7, 9, 7, 9]
 
 
-def recorded(journal: DetectionJournal, seen: Sighting) -> Sighting:
+def recorded(journal: AmendableJournal, seen: Sighting) -> Sighting:
     seen.row = journal.record(seen.stamp_ns, 7, Outcome.WAITING)
     return seen
 
@@ -307,7 +307,7 @@ def recorded(journal: DetectionJournal, seen: Sighting) -> Sighting:
 def test_a_misfit_is_one_of_the_identity_only_where_the_estimate_is_sure(sigma_m: float, stays: bool) -> None:
     """Seen 0.3 m off from a second pose: as it stands, it is of nothing; expected with the pose's error, it may be."""
     smoother = smoother_with(1e9, 0.1, 1e9)
-    landmarks = LandmarkGraph(smoother, SightingFactors(SonarCalibration(), plain), journal := DetectionJournal())
+    landmarks = LandmarkGraph(smoother, SightingFactors(SonarCalibration(), plain), journal := AmendableJournal())
     for k, sigma in enumerate((0.001, sigma_m)):
         smoother.add_pose(X(k), gtsam.Pose3(), float(k))
         sigmas = np.array([1e-3] * 3 + [sigma] * 3)
@@ -372,7 +372,7 @@ def test_the_choices_that_settle_are_the_cheapest_of_all(said: list[int]) -> Non
         smoother.add({"prior": KNOWN.at(k)})
     smoother.update(5.0)
     landmarks = LandmarkGraph(
-        smoother, SightingFactors(SonarCalibration(elevation_aperture_rad=0.3), plain), DetectionJournal()
+        smoother, SightingFactors(SonarCalibration(elevation_aperture_rad=0.3), plain), AmendableJournal()
     )
     policy = MixtureIdentities(landmarks, MixtureIdentity(), GAUSSIAN)
     stated = enumerate(zip(places, said, strict=True))

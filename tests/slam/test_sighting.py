@@ -12,10 +12,10 @@ from scipy.optimize import least_squares
 
 from sonar_graph.calibration import FloorPrior, SonarCalibration
 from sonar_graph.measurements import Floats
-from sonar_graph.slam.landmarks.landmark_graph import Assignment, LandmarkGraph
+from sonar_graph.slam.landmarks.landmark_graph import AmendableJournal, Assignment, LandmarkGraph
 from sonar_graph.slam.landmarks.sighting import Sighting, SightingFactors, place
 from sonar_graph.slam.smoother import Changed, Sightline
-from sonar_graph.states import DetectionJournal, Outcome
+from sonar_graph.states import Outcome
 
 from .made import graph_of, plain, polar, pose_prior, smoother_with, values_of
 
@@ -35,7 +35,7 @@ def begun() -> LandmarkGraph:
         smoother.add_pose(X(k), pose, float(k))
         smoother.add({"prior": pose_prior(X(k), pose, 0.01)})
     smoother.update(float(POSES))
-    return LandmarkGraph(smoother, MAKER, DetectionJournal())
+    return LandmarkGraph(smoother, MAKER, AmendableJournal())
 
 
 def sighting_of(landmark_id: int, k: int, floor: FloorPrior | None, landmarks: LandmarkGraph) -> Sighting:

@@ -16,7 +16,7 @@ from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 from sonar_graph.slam.landmarks import unknown as module
 from sonar_graph.slam.landmarks.joint_compatibility import UNPAIRED, Innovations, Pairing, pair_jointly
-from sonar_graph.slam.landmarks.landmark_graph import Assignment, LandmarkGraph
+from sonar_graph.slam.landmarks.landmark_graph import AmendableJournal, Assignment, LandmarkGraph
 from sonar_graph.slam.landmarks.sighting import Sighting, SightingFactors, late_view
 from sonar_graph.slam.landmarks.unknown import (
     ODDS,
@@ -26,7 +26,7 @@ from sonar_graph.slam.landmarks.unknown import (
 )
 from sonar_graph.slam.smoother.batch_solution import JointCovariance, Sightline
 from sonar_graph.slam.smoother.incremental import Smoother
-from sonar_graph.states import FIRST_ANONYMOUS_ID, DetectionJournal, Outcome
+from sonar_graph.states import FIRST_ANONYMOUS_ID, Outcome
 
 from .graphs import assert_same_graph
 from .late_identities import assert_outcomes_account, run
@@ -196,7 +196,7 @@ def anonymous(
     """A known pose, and a landmark straight ahead."""
     smoother = smoother_with(1e9, 0.1, 1e9)
     maker = SightingFactors(SonarCalibration(elevation_aperture_rad=aperture_rad), plain)
-    landmarks = LandmarkGraph(smoother, maker, DetectionJournal())
+    landmarks = LandmarkGraph(smoother, maker, AmendableJournal())
     smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
     smoother.add({"prior": pose_prior(X(0), gtsam.Pose3(), 1e-4)})
     smoother.update(0.0)
@@ -249,7 +249,7 @@ def nearest(
 ) -> tuple[int, int] | None:
     """Of landmarks at points with a joint covariance, each seen in some frames; rooted ones also before the window."""
     smoother = smoother_with(1e9, 0.1, 1e9)
-    landmarks = LandmarkGraph(smoother, SightingFactors(SonarCalibration(), plain), DetectionJournal())
+    landmarks = LandmarkGraph(smoother, SightingFactors(SonarCalibration(), plain), AmendableJournal())
     values, ids = gtsam.Values(), {i: i if i in named else FIRST_ANONYMOUS_ID + i for i in points}
     for (i, point), range_m in zip(points.items(), ranges_m, strict=True):
         values.insert(L(ids[i]), np.array(point))

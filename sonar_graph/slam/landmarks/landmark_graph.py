@@ -17,8 +17,10 @@ out, in whatever order, the graph depends only on which sightings are of which l
 
 from __future__ import annotations
 
+from array import array
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Set
+from copy import deepcopy
 from typing import NamedTuple, Protocol
 
 from gtsam.symbol_shorthand import L
@@ -27,7 +29,7 @@ from sonar_graph.measurements import Floats, LandmarkDetections
 from sonar_graph.slam.estimates import Solution
 from sonar_graph.slam.landmarks.sighting import SeenFrame, Sighting, SightingFactors
 from sonar_graph.slam.smoother import Changed, FactorGroup, Smoother
-from sonar_graph.states import DetectionJournal, Outcome
+from sonar_graph.states import OUTCOME_NUMBERS, UNKNOWN, DetectionJournal, Outcome
 
 IN_GRAPH = frozenset(
     {Outcome.USED, Outcome.NEW, Outcome.USED_LATER, Outcome.PLACED_LATER, Outcome.MOVED, Outcome.REASSIGNED}
@@ -89,10 +91,49 @@ class IdentityPolicy(Protocol):
         """Assignments of that solution that the run itself does not make."""
 
 
+class AmendableJournal(DetectionJournal):
+    """Journal of detections whose outcomes may change later, and whose old rows may be dropped."""
+
+    def forget_before(self, stamp_ns: int) -> None:
+        """Drop rows until the first that is not older than ``stamp_ns``; the others keep their numbers."""
+        count = 0
+        while count < len(self) and self._stamps_ns[count] < stamp_ns:
+            count += 1
+        del self._stamps_ns[:count], self._ids[:count], self._outcomes[:count]
+        del self._innovations[: 2 * count], self._innovation_covs[: 4 * count]
+        self._forgotten += count
+
+    def copy(self) -> AmendableJournal:
+        """Independent copy."""
+        return deepcopy(self)
+
+    def amend(
+        self,
+        row: int,
+        outcome: Outcome,
+        landmark_id: int | None = None,
+        innovation: Floats | None = None,
+        innovation_cov: Floats | None = None,
+    ) -> None:
+        """Change the outcome of a row, and its landmark unless None; innovation and covariance as in `record`.
+
+        An earlier innovation is dropped: it was against the landmark that the detection was first taken for.
+        """
+        row -= self._forgotten
+        if row < 0:
+            return
+        self._outcomes[row] = OUTCOME_NUMBERS[outcome]
+        self._ids[row] = self._ids[row] if landmark_id is None else landmark_id
+        e = UNKNOWN[:2] if innovation is None else innovation.tolist()
+        S = UNKNOWN if innovation_cov is None else innovation_cov.ravel().tolist()
+        self._innovations[2 * row : 2 * row + 2] = array("d", e)
+        self._innovation_covs[4 * row : 4 * row + 4] = array("d", S)
+
+
 class LandmarkGraph:
     """Sightings that are in the graph, by landmark, and the journal of all detections."""
 
-    def __init__(self, smoother: Smoother, factors: SightingFactors, journal: DetectionJournal) -> None:
+    def __init__(self, smoother: Smoother, factors: SightingFactors, journal: AmendableJournal) -> None:
         self.smoother, self.factors, self.journal = smoother, factors, journal
         self._of: dict[int, dict[Sighting, None]] = defaultdict(dict)
         self._rooted: dict[int, Sighting] = {}
@@ -151,7 +192,7 @@ class LandmarkGraph:
         if leaving or coming:
             self._exchange(leaving, coming, time_s)
 
-    def rechosen(self, assignments: list[Assignment]) -> DetectionJournal:
+    def rechosen(self, assignments: list[Assignment]) -> AmendableJournal:
         """Copy of the journal as other assignments would have it; nothing else changes."""
         journal = self.journal.copy() if assignments else self.journal
         for sighting, outcome, landmark_id, *_ in assignments:

@@ -1,12 +1,12 @@
-"""Sonar model and Jacobians (`sonar_model`), factors (`factors`, `inertial_factors`), views (`prediction`)."""
+"""Sonar model (`sonar_model`, `views`), factors (`factors`, `inertial_factors`), predicted frames (`prediction`)."""
 
 # fmt: off
 from sonar_graph.slam.models.factors import GaussianKernel, Kernel, KernelParams, Robust, RobustKernel
 from sonar_graph.slam.models.prediction import PredictedView, Source
 from sonar_graph.slam.models.sonar_model import (
-    FLOOR_GATE, elevation_on_floor, locate, locate_jacobians, project, range_azimuth_jacobians,
-    sonar_point, sonar_point_jacobian, wrap_angle,
+    FLOOR_GATE, elevation_on_floor, project, sonar_point, sonar_point_jacobian, wrap_angle,
 )
+from sonar_graph.slam.models.views import locate, locate_jacobians, range_azimuth_jacobians
 
 __all__ = [
     "FLOOR_GATE", "GaussianKernel", "Kernel", "KernelParams", "PredictedView", "Robust", "RobustKernel", "Source",

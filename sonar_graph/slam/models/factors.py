@@ -29,7 +29,8 @@ from sonar_graph.calibration import Calibration, PlanarMotion, Section
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Floats
 from sonar_graph.navigation import PreintegratedMotion
-from sonar_graph.slam.models.sonar_model import range_azimuth_jacobians, wrap_angle
+from sonar_graph.slam.models.sonar_model import wrap_angle
+from sonar_graph.slam.models.views import range_azimuth_jacobians
 from sonar_graph.tagged_sections import tagged
 
 UNINFORMATIVE_M = 1e5

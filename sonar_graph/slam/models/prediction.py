@@ -1,7 +1,7 @@
 """Prediction of a sonar frame from the graph: range and azimuth of landmarks, with covariances.
 
 With the motion M from a keyframe X to the frame, its noise covariance Q, its derivative D by the gyro bias b, and the
-sonar mounted at T, the landmark p is expected at ``h(X M T, p)``, h of `sonar_graph.slam.models.sonar_model`. The
+sonar mounted at T, the landmark p is expected at ``h(X M T, p)``, h of `sonar_graph.slam.models.views`. The
 expectation has the covariance ``H P H' + H_M Q H_M'``: P of (X, b, p) together, ``H = [H_X, H_M D, H_p]``, H_M the
 derivative by the body's pose at the frame.
 """
@@ -13,7 +13,7 @@ import numpy as np
 
 from sonar_graph.measurements import Floats
 from sonar_graph.navigation import PreintegratedMotion
-from sonar_graph.slam.models.sonar_model import project_all
+from sonar_graph.slam.models.views import project_all
 from sonar_graph.slam.smoother import JointCovariance
 
 

@@ -1,22 +1,15 @@
-"""Range and azimuth of a landmark, seen by a sonar on a body: the model, its inverse, and their derivatives.
+"""Range and azimuth of a landmark in a sonar's own axes: the model, its inverse, and their derivatives.
 
-With the landmark p in the world and the sonar at ``world_T_sonar = world_T_body body_T_sonar``::
+With q the landmark in sonar axes, x along the centre of the aperture, y to the left, z up, h its distance from z::
 
-    q       = sonar_R_world (p - world_p_sonar)
-    range   = |q|
-    azimuth = atan2(q_y, q_x)
+    range = |q|,    azimuth = atan2(q_y, q_x)
 
-    D_q     = [ q^T / |q|                             ]     D_q: derivative of (range, azimuth) by q, shape (2, 3)
-              [ -q_y / h^2,    q_x / h^2,    0        ]     h^2 = q_x^2 + q_y^2
-
-    by the body pose    D_q [ [q]x | -I ] Ad(sonar_T_body)      right perturbation [theta, rho], shape (2, 6)
-    by the landmark     D_q sonar_R_world                       shape (2, 3)
-
-Sonar axes: x along the centre of the aperture, y to the left, z up; h is the distance from the z axis.
+    D_q   = [ q^T / |q|                             ]     D_q: derivative of (range, azimuth) by q, shape (2, 3)
+            [ -q_y / h^2,    q_x / h^2,    0        ]     h^2 = q_x^2 + q_y^2
 
 The inverse model needs the elevation, which a sonar does not measure: ``elevation = asin(q_z / |q|)``. On a floor of
 known height it follows from range and azimuth. Azimuth has no derivative on the z axis (h = 0); a landmark there is
-outside every aperture.
+outside every aperture. From poses in the world: `sonar_graph.slam.models.views`.
 """
 
 import math
@@ -63,36 +56,6 @@ def project(q: Floats) -> tuple[Floats, Floats]:
     return z, D_q
 
 
-@compiled
-def project_all(points: Floats, world_T_sonar: Floats) -> tuple[Floats, Floats, Floats]:
-    """Range and azimuth of points of the world, shape (m, 3), from a sonar's pose, shape (4, 4).
-
-    Returns
-    -------
-    (range m, azimuth rad), shape (m, 2); their derivatives by the right perturbation of the sonar's pose,
-    ``D_q [[q]x | -I]``, shape (m, 2, 6), and by the point, ``D_q sonar_R_world``, shape (m, 2, 3).
-    """
-    T, m = world_T_sonar, len(points)
-    view, by_sonar, by_point = np.empty((m, 2)), np.zeros((m, 2, 6)), np.empty((m, 2, 3))
-    for k in range(m):
-        dx, dy, dz = points[k, 0] - T[0, 3], points[k, 1] - T[1, 3], points[k, 2] - T[2, 3]
-        x = T[0, 0] * dx + T[1, 0] * dy + T[2, 0] * dz
-        y = T[0, 1] * dx + T[1, 1] * dy + T[2, 1] * dz
-        z = T[0, 2] * dx + T[1, 2] * dy + T[2, 2] * dz
-        h2 = x * x + y * y
-        r = math.sqrt(h2 + z * z)
-        view[k, 0], view[k, 1] = r, math.atan2(y, x)
-        by_sonar[k, 0, 3], by_sonar[k, 0, 4], by_sonar[k, 0, 5] = -x / r, -y / r, -z / r  # q^T [q]x = 0
-        by_sonar[k, 1, 0], by_sonar[k, 1, 1], by_sonar[k, 1, 2] = x * z / h2, y * z / h2, -1.0
-        by_sonar[k, 1, 3], by_sonar[k, 1, 4] = y / h2, -x / h2
-        for i in range(2):
-            for j in range(3):
-                by_point[k, i, j] = -(
-                    by_sonar[k, i, 3] * T[j, 0] + by_sonar[k, i, 4] * T[j, 1] + by_sonar[k, i, 5] * T[j, 2]
-                )
-    return view, by_sonar, by_point
-
-
 def sonar_point(range_m: float, azimuth_rad: float, elevation_rad: float) -> Floats:
     """The point in the sonar frame with these spherical coordinates, shape (3,), m."""
     level = range_m * math.cos(elevation_rad)
@@ -109,48 +72,6 @@ def sonar_point_jacobian(range_m: float, azimuth_rad: float, elevation_rad: floa
             [se, 0.0, range_m * ce],
         ]
     )
-
-
-def range_azimuth(world_T_sonar: gtsam.Pose3, p_world: Floats) -> Floats:
-    """Range (m) and azimuth (rad) at which a sonar sees a point, shape (2,)."""
-    return project_all(p_world[None], world_T_sonar.matrix())[0][0]
-
-
-def range_azimuth_jacobians(
-    world_T_body: gtsam.Pose3, body_T_sonar: gtsam.Pose3, p_world: Floats
-) -> tuple[Floats, Floats, Floats]:
-    """Range and azimuth with derivatives.
-
-    Returns
-    -------
-    (range m, azimuth rad), shape (2,); the derivative by the body pose's right perturbation [theta, rho], shape (2, 6);
-    the derivative by the landmark, shape (2, 3).
-    """
-    (z,), (by_sonar,), (by_point,) = project_all(p_world[None], world_T_body.compose(body_T_sonar).matrix())
-    return z, by_sonar @ body_T_sonar.inverse().AdjointMap(), by_point
-
-
-def locate(world_T_sonar: gtsam.Pose3, range_m: float, azimuth_rad: float, elevation_rad: float) -> Floats:
-    """The point in the world that a sonar sees there, shape (3,), m."""
-    return np.asarray(world_T_sonar.transformFrom(sonar_point(range_m, azimuth_rad, elevation_rad)))
-
-
-def locate_jacobians(
-    world_T_body: gtsam.Pose3, body_T_sonar: gtsam.Pose3, range_m: float, azimuth_rad: float, elevation_rad: float
-) -> tuple[Floats, Floats, Floats]:
-    """A located point with derivatives.
-
-    Returns
-    -------
-    The point, shape (3,), m; its derivative by the body pose's right perturbation [theta, rho], shape (3, 6); its
-    derivative by (range, azimuth, elevation), shape (3, 3).
-    """
-    world_T_sonar = world_T_body.compose(body_T_sonar)
-    R_body, R_sonar = world_T_body.rotation().matrix(), world_T_sonar.rotation().matrix()
-    point = locate(world_T_sonar, range_m, azimuth_rad, elevation_rad)
-    p_body = np.asarray(world_T_body.transformTo(point), dtype=np.float64)
-    by_pose = R_body @ np.hstack([-gtsam.SO3.Hat(p_body), np.eye(3)])
-    return point, by_pose, R_sonar @ sonar_point_jacobian(range_m, azimuth_rad, elevation_rad)
 
 
 def elevation_on_floor(
