@@ -6,11 +6,10 @@ in its name or docstring. Every estimator gets the same one.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 STANDARD_GRAVITY = 9.80665
@@ -116,18 +115,6 @@ class SonarImage(Section):
     """The largest sample."""
     gamma: Positive = 1.0
     """Power to which the amplitude was raised, of linear samples (Oculus)."""
-
-    def decibels(self, samples: NDArray[Any]) -> NDArray[np.float32]:
-        """Levels of samples in dB over the smallest one; only differences have a meaning.
-
-        ``samples * decibel_span / full_scale``, or ``20 / gamma log10(samples)`` of linear ones; linear samples of 0
-        count as one count, real ones below 1/100000 of the full scale as that.
-        """
-        if self.scale == "decibel":
-            return np.multiply(samples, np.float32(self.decibel_span / self.full_scale), dtype=np.float32)
-        least = 1.0 if np.issubdtype(samples.dtype, np.integer) else 1e-5 * self.full_scale
-        ratio = np.maximum(samples, np.float32(least)) / np.float32(least)
-        return np.float32(20.0 / self.gamma) * np.log10(ratio, dtype=np.float32)
 
 
 class SonarCalibration(Section):

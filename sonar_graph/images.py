@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sonar_graph.calibration import SonarImage
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Floats, Ints
 
@@ -56,3 +57,16 @@ class SonarFrames:
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
+
+
+def decibels(samples: NDArray[Any], image: SonarImage) -> NDArray[np.float32]:
+    """Levels of samples in dB over the smallest one; only differences have a meaning.
+
+    ``samples * decibel_span / full_scale``, or ``20 / gamma log10(samples)`` of linear ones; linear samples of 0
+    count as one count, real ones below 1/100000 of the full scale as that.
+    """
+    if image.scale == "decibel":
+        return np.multiply(samples, np.float32(image.decibel_span / image.full_scale), dtype=np.float32)
+    least = 1.0 if np.issubdtype(samples.dtype, np.integer) else 1e-5 * image.full_scale
+    ratio = np.maximum(samples, np.float32(least)) / np.float32(least)
+    return np.float32(20.0 / image.gamma) * np.log10(ratio, dtype=np.float32)

@@ -38,6 +38,7 @@ sys.path.append(str(Path(__file__).resolve().parents[1]))
 from common import conclude, in_parallel, make_parser, note, print_table, recording
 
 from sonar_graph.calibration import SonarImage
+from sonar_graph.images import decibels
 from sonar_graph.measurements import Floats
 from sonar_graph.sonar.cfar import DetectionParams, select_candidates
 from sonar_graph.sonar.regions import measure_regions
@@ -131,7 +132,7 @@ Detector = Callable[[Frame, DetectionParams], tuple[Labels, NDArray[Any]]]
 
 
 def ours(change: dict[str, float], frame: Frame, settings: DetectionParams) -> tuple[Labels, NDArray[Any]]:
-    level = SonarImage().decibels(frame.polar)
+    level = decibels(frame.polar, SonarImage())
     params = settings.model_copy(update=change)
     candidates = select_candidates(level, frame.ranges_m, frame.azimuths_rad, None, params)
     return candidates.labels, candidates.accepted + 1
@@ -154,7 +155,7 @@ def soca_factor(pfa: float, training: int = 40) -> float:
 def soca(setting: tuple[float, float], is_power: bool, frame: Frame, settings: DetectionParams) -> Any:
     pfa, gate = setting
     image = frame.polar.astype(np.float64)
-    cells = 10 ** (SonarImage().decibels(frame.polar).astype(np.float64) / 10) if is_power else image
+    cells = 10 ** (decibels(frame.polar, SonarImage()).astype(np.float64) / 10) if is_power else image
     half, guard = 20, 5
     total = np.pad(np.cumsum(cells, axis=1), ((0, 0), (1, 0)))
     bins = cells.shape[1]

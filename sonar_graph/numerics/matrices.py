@@ -76,27 +76,21 @@ RULES: dict[str, dict[tuple[type, type], Rule]] = {
     "add": {
         (Vec3, Vec3): lambda a, b: Vec3(a.x + b.x, a.y + b.y, a.z + b.z),
         (Mat3, Mat3): lambda a, b: Mat3(a.x + b.x, a.y + b.y, a.z + b.z),
-        (Vec6, Vec6): lambda a, b: Vec6(a.a + b.a, a.b + b.b),
         (Mat6, Mat6): lambda a, b: Mat6(a.a + b.a, a.b + b.b, a.c + b.c, a.d + b.d),
     },
     "sub": {
         (Vec3, Vec3): lambda a, b: Vec3(a.x - b.x, a.y - b.y, a.z - b.z),
         (Mat3, Mat3): lambda a, b: Mat3(a.x - b.x, a.y - b.y, a.z - b.z),
-        (Vec6, Vec6): lambda a, b: Vec6(a.a - b.a, a.b - b.b),
-        (Mat6, Mat6): lambda a, b: Mat6(a.a - b.a, a.b - b.b, a.c - b.c, a.d - b.d),
     },
     "mul": {
         (float, Vec3): lambda a, b: Vec3(a * b.x, a * b.y, a * b.z),
         (float, Mat3): lambda a, b: Mat3(a * b.x, a * b.y, a * b.z),
-        (float, Vec6): lambda a, b: Vec6(a * b.a, a * b.b),
-        (float, Mat6): lambda a, b: Mat6(a * b.a, a * b.b, a * b.c, a * b.d),
     },
     "matmul": {
         (Vec3, Vec3): lambda a, b: a.x * b.x + a.y * b.y + a.z * b.z,
         (Mat3, Vec3): lambda a, b: Vec3(a.x @ b, a.y @ b, a.z @ b),
         (Mat3, Mat3): lambda a, b: Mat3(b.T @ a.x, b.T @ a.y, b.T @ a.z),
         (Mat3, Skew): lambda a, b: Mat3(cross(a.x, b.v), cross(a.y, b.v), cross(a.z, b.v)),
-        (Skew, Vec3): lambda a, b: cross(a.v, b),
         (Skew, Mat3): lambda a, b: Mat3(cross(a.v, b.T.x), cross(a.v, b.T.y), cross(a.v, b.T.z)).T,
         (Vec6, Vec6): lambda a, b: a.a @ b.a + a.b @ b.b,
         (Mat6, Vec6): lambda a, b: Vec6(a.a @ b.a + a.b @ b.b, a.c @ b.a + a.d @ b.b),

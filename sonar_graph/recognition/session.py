@@ -16,7 +16,7 @@ import numpy as np
 from sonar_graph.calibration import Calibration
 from sonar_graph.devices import LandmarkDesign
 from sonar_graph.errors import LogError, MeasurementError
-from sonar_graph.images import SonarFrames
+from sonar_graph.images import SonarFrames, decibels
 from sonar_graph.logs import PartialCalibration, read_log, read_sonar_frames
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.logs.mcap import TimeWindow
@@ -290,7 +290,7 @@ class RecognitionSession:
             self._fan = Fan.of(frame.ranges_m, frame.azimuths_rad)
             self._fan_of = (id(frame.ranges_m), id(frame.azimuths_rad))
         ids, probabilities = found.most_probable() if found is not None else (np.empty(0, int), np.empty(0))
-        picture = draw_fan(self._sonar.image.decibels(frame.intensity[0]), self._fan, found)
+        picture = draw_fan(decibels(frame.intensity[0], self._sonar.image), self._fan, found)
         pictures.append(DrawnFrame(stamp_ns, as_jpeg(picture), tuple(ids.tolist()), tuple(probabilities.tolist())))
         if len(pictures) > MOST_PICTURES:
             del pictures[1::2]

@@ -21,7 +21,7 @@ from pydantic import Field
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.devices import LandmarkDesign
 from sonar_graph.errors import CalibrationError
-from sonar_graph.images import SonarFrames
+from sonar_graph.images import SonarFrames, decibels
 from sonar_graph.measurements import Floats, LandmarkDetections
 from sonar_graph.sonar.frame_check import FrameCheck, check_block
 from sonar_graph.sonar.geometry import FloorView, points
@@ -117,7 +117,7 @@ class AcTagRecogniser:
             self.fates = [Fate(stamp_ns, -1, np.nan, np.nan, f"frame not used: {fault}")]
             return None
         bit_m = settings.tag_size_m / BITS_OF_INNER_SQUARE
-        image_db = self._image.decibels(frame.intensity[0])
+        image_db = decibels(frame.intensity[0], self._image)
         picture_db, rows_m, columns_rad = evenly_sampled(
             image_db, frame.ranges_m, frame.azimuths_rad, bit_m / settings.pixels_per_bit
         )

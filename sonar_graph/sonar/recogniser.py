@@ -16,7 +16,7 @@ from scipy.optimize import linear_sum_assignment
 
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.devices import DEFAULT_DESIGNS, LandmarkDesign
-from sonar_graph.images import SonarFrames
+from sonar_graph.images import SonarFrames, decibels
 from sonar_graph.measurements import Floats, Ints, LandmarkDetections
 from sonar_graph.sonar.appearance import Appearance, AppearanceParams, CandidateFit, ObjectSighting
 from sonar_graph.sonar.bayes import Beliefs, IdentityParams
@@ -155,7 +155,7 @@ class Recogniser:
             self._tracker.skip(motion or SonarStep.none())
             self.fates = [Fate(stamp_ns, -1, np.nan, np.nan, f"frame not used: {fault}")]
             return None
-        image_db = self._calibration.sonar.image.decibels(np.ascontiguousarray(frame.intensity[0]))
+        image_db = decibels(np.ascontiguousarray(frame.intensity[0]), self._calibration.sonar.image)
         candidates = select_candidates(image_db, frame.ranges_m, frame.azimuths_rad, view, self.params.detection)
         association = self._tracker.step(candidates, motion, stamp_ns)
         self.track_ids = association.ids

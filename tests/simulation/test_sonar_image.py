@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import SonarImage
 from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
+from sonar_graph.images import decibels
 from sonar_graph.measurements import Floats
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 from sonar_graph.simulation.sonar_image import scene
@@ -324,7 +325,7 @@ def test_counts_are_decibels_over_the_span(span: float):
     counts = made.frame(ABOVE, TILT, 0)
     inside = (counts > 0) & (counts < 255)
     assert inside.mean() > 0.9
-    found = SonarImage(decibel_span=span).decibels(counts)
+    found = decibels(counts, SonarImage(decibel_span=span))
     np.testing.assert_allclose(found[inside], level_db(made)[inside], atol=0.5 * span / 255 + 1e-4)
 
 

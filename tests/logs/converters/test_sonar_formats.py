@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sonar_graph.errors import DatasetError
+from sonar_graph.images import decibels
 from sonar_graph.logs.reading import read_sonar_frames
 
 from .sonar_recordings import CONVERTERS, START_NS, STEP_NS, Aris, Ddf, Oculus, converted, images, log_of, no_ping, put
@@ -118,8 +119,8 @@ def test_readings_of_other_sensors_and_the_kind_of_time_are_in_the_notes(tmp_pat
 
 def test_the_log_says_the_scale_of_the_samples(tmp_path):
     for recording, span_db in ((Ddf(images(1, 96, 64)), 90), (Aris(images(1, 128, 64)), 80)):
-        decibels = log_of(tmp_path, recording).image.decibels(np.array([0, 51, 255], np.uint8))
-        np.testing.assert_allclose(decibels, [0, 0.2 * span_db, span_db], rtol=1e-6)
+        levels_db = decibels(np.array([0, 51, 255], np.uint8), log_of(tmp_path, recording).image)
+        np.testing.assert_allclose(levels_db, [0, 0.2 * span_db, span_db], rtol=1e-6)
     for kind, code, full_scale, gamma in (("u1", 0, 255, 1), ("u2", 255, 65_535, 1), ("u1", 51, 255, 0.2)):
         image = log_of(tmp_path, Oculus(images(1, 16, 8).astype(kind), gamma_code=code)).image
         assert (image.scale, image.full_scale) == ("linear", full_scale)
