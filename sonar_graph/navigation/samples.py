@@ -1,6 +1,7 @@
 """Rows of a sensor by their stamps: storage, and checks of what a caller gives."""
 
 from math import isfinite
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,28 +25,35 @@ class StampedRows:
     """
 
     def __init__(self, one: tuple[int, ...], other: tuple[int, ...]) -> None:
-        self.stamps_ns: Ints = np.empty(0, np.int64)
-        self.values: tuple[Floats, Floats] = np.empty((0, *one)), np.empty((0, *other))
+        self._show(0, np.empty(0, np.int64), np.empty((0, *one)), np.empty((0, *other)))
 
     def insert(self, stamps_ns: Ints, one: Floats, other: Floats) -> bool:
         """Place rows by their increasing stamps; of equal stamps the first counts.
 
         Returns True where the first row comes before a row that was there already, or repeats its stamp.
         """
-        comes_after = not len(self.stamps_ns) or bool(stamps_ns[0] > self.stamps_ns[-1])
-        self.stamps_ns = np.concatenate([self.stamps_ns, stamps_ns])
-        self.values = np.concatenate([self.values[0], one]), np.concatenate([self.values[1], other])
+        n, end = len(self.stamps_ns), len(self.stamps_ns) + len(stamps_ns)
+        comes_after = not n or bool(stamps_ns[0] > self.stamps_ns[-1])
+        columns = self._columns
+        if end > len(columns[0]):  # room for as many rows again
+            columns = [np.concatenate([old[:n], np.empty((end, *old.shape[1:]), old.dtype)]) for old in columns]
+        columns[0][n:end], columns[1][n:end], columns[2][n:end] = stamps_ns, one, other
+        self._show(end, *columns)
         if not comes_after:
-            self._keep(np.unique(self.stamps_ns, return_index=True)[1])
+            kept = np.unique(self.stamps_ns, return_index=True)[1]
+            self._show(len(kept), *(column[kept] for column in columns))
         return not comes_after
 
     def forget_before(self, stamp_ns: int, more: int = 0) -> None:
         """Drop rows that no value from a stamp on needs, but keep ``more`` of them."""
-        self._keep(slice(max(int(np.searchsorted(self.stamps_ns, stamp_ns)) - 1 - more, 0), None))
+        first = max(int(np.searchsorted(self.stamps_ns, stamp_ns)) - 1 - more, 0)
+        self._show(len(self.stamps_ns) - first, *(column[first:] for column in self._columns))
 
-    def _keep(self, rows: slice | Ints) -> None:
-        self.stamps_ns = self.stamps_ns[rows]
-        self.values = self.values[0][rows], self.values[1][rows]
+    def _show(self, n: int, stamps_ns: Ints, one: Floats, other: Floats) -> None:
+        """Take columns, of which the first n rows are filled."""
+        self._columns: list[NDArray[Any]] = [stamps_ns, one, other]
+        self.stamps_ns: Ints = stamps_ns[:n]
+        self.values: tuple[Floats, Floats] = one[:n], other[:n]
 
 
 UNITS_NS = {"seconds": 1_000_000_000, "milliseconds": 1_000_000, "microseconds": 1_000}
@@ -155,6 +163,10 @@ def longest_interval_ns(calibration: Calibration) -> int:
     return LATEST_NS if calibration.odometry_interpolation == "hold-past" else round(calibration.dvl.gap_s * 1e9)
 
 
+PARTIAL_M2_S2 = 0.5 * UNMEASURED_M_S**2
+"""Sum of variances beyond which a direction is unmeasured."""
+
+
 def in_numbers(velocity_cov: Floats, unsaid: Floats) -> Floats:
     """Covariances of shape (n, 3, 3) without NaN and infinity.
 
@@ -177,4 +189,4 @@ def in_numbers(velocity_cov: Floats, unsaid: Floats) -> Floats:
 
 def is_partial(velocity_cov: Floats) -> NDArray[np.bool_]:
     """True for covariances of shape (n, 3, 3) with an unmeasured direction, shape (n,)."""
-    return np.asarray(velocity_cov.diagonal(axis1=1, axis2=2).sum(axis=1) > 0.5 * UNMEASURED_M_S**2)
+    return np.asarray(velocity_cov.diagonal(axis1=1, axis2=2).sum(axis=1) > PARTIAL_M2_S2)

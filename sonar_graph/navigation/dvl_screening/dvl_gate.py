@@ -20,8 +20,6 @@ row, with the variance of what may have changed since. Of a chain that ends a ga
 rows are no epochs. Stamps decide, not how a log is cut. docs/theory/gaps.md.
 """
 
-from collections.abc import Iterable
-from operator import add
 from typing import NamedTuple
 
 import numpy as np
@@ -29,7 +27,10 @@ from numpy.typing import NDArray
 
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.navigation.dvl_screening.partial_beams import Rows
-from sonar_graph.navigation.samples import EARLIEST_NS, LATEST_NS, is_partial
+from sonar_graph.navigation.samples import EARLIEST_NS, LATEST_NS, PARTIAL_M2_S2
+from sonar_graph.navigation.steps import covariance, rows_until
+from sonar_graph.navigation.steps import row as row_of
+from sonar_graph.numerics import O3, ZERO, Mat3, Vec3, compiled, inlined
 from sonar_graph.states import Refusal, RefusedRow
 
 Flags = NDArray[np.bool_]
@@ -51,6 +52,7 @@ class GateResult(NamedTuple):
     """True where no row is partial or an outlier."""
 
 
+@compiled
 def gate_velocities(
     stamps: Ints,
     velocity: Floats,
@@ -66,33 +68,29 @@ def gate_velocities(
     ``walk`` is the root spectral density of the velocity's random walk, m/s/√s; ``gate`` the squared distance beyond
     which a row is an outlier.
     """
-    distance, outlier, partial, is_plain = np.zeros(len(stamps)), np.zeros(len(stamps), np.bool_), is_partial(cov), True
-    before = int(known_ns.searchsorted(stamps[0])) - 1
-    last_ns, u, Q_u = LATEST_NS, [0.0] * 3, [0.0] * 9
+    n, is_plain, last_ns, u, Q_u = len(stamps), True, LATEST_NS, ZERO, O3
+    distance, is_partial, is_outlier = np.zeros(n), np.zeros(n, np.bool_), np.zeros(n, np.bool_)
+    before = rows_until(known_ns, stamps[0] - 1) - 1
     if before >= 0:
-        last_ns, u, Q_u = int(known_ns[before]), known_velocity[before].tolist(), known_cov[before].ravel().tolist()
-    rows = zip(stamps.tolist(), velocity.tolist(), cov.reshape(-1, 9).tolist(), partial.tolist(), strict=True)
-    for k, (stamp_ns, v, Q_v, is_without_direction) in enumerate(rows):
-        squared = squared_distance(u, Q_u, v, Q_v, (stamp_ns - last_ns) * 1e-9, walk) if stamp_ns > last_ns else 0.0
-        distance[k] = squared
-        if is_without_direction or squared > gate:
-            outlier[k], is_plain = squared > gate, False
+        last_ns, u, Q_u = known_ns[before], row_of(known_velocity, before), covariance(known_cov, before)
+    for k in range(len(stamps)):
+        v, Q_v = row_of(velocity, k), covariance(cov, k)
+        if stamps[k] > last_ns:
+            distance[k] = squared_distance(u, Q_u, v, Q_v, (stamps[k] - last_ns) * 1e-9, walk)
+        is_partial[k], is_outlier[k] = Q_v.x.x + Q_v.y.y + Q_v.z.z > PARTIAL_M2_S2, distance[k] > gate
+        if is_partial[k] or is_outlier[k]:
+            is_plain = False
         else:
-            last_ns, u, Q_u = stamp_ns, v, Q_v
-    return GateResult(distance, partial, outlier, is_plain)
+            last_ns, u, Q_u = stamps[k], v, Q_v
+    return GateResult(distance, is_partial, is_outlier, is_plain)
 
 
-def squared_distance(
-    u: Iterable[float], Q_u: Iterable[float], v: Iterable[float], Q_v: Iterable[float], t: float, walk: float
-) -> float:
-    """``e^T S^-1 e``, ``e = v - u``, of two velocities t seconds apart; covariances as nine elements.
-
-    S^-1 is the adjugate of S over its determinant. Numbers one by one: an array operation costs as much as all of them.
-    """
-    (u_x, u_y, u_z), (v_x, v_y, v_z) = u, v
-    x, y, z = v_x - u_x, v_y - u_y, v_z - u_z
-    may_change = walk**2 * t + min(TURNING_RAD_S * t, 2.0) ** 2 * (u_x * u_x + u_y * u_y + u_z * u_z)
-    xx, xy, xz, _, yy, yz, _, _, zz = map(add, Q_u, Q_v)
+@inlined
+def squared_distance(u: Vec3, Q_u: Mat3, v: Vec3, Q_v: Mat3, t: float, walk: float) -> float:
+    """``e^T S^-1 e``, ``e = v - u``, of two velocities t seconds apart; S^-1 is the adjugate over the determinant."""
+    x, y, z = v - u
+    may_change = walk**2 * t + min(TURNING_RAD_S * t, 2.0) ** 2 * (u @ u)
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = Q_u + Q_v
     xx, yy, zz = xx + may_change, yy + may_change, zz + may_change
     a, b, c = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
     d, e, f = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
@@ -222,8 +220,8 @@ class VelocityConfirmation:
     def _distance(self, one: WaitingRow, other: WaitingRow) -> float:
         """Squared distance; the slower of the two says how much turning can change."""
         fast, slow = sorted((one, other), key=lambda row: -float(row.velocity @ row.velocity))
-        elapsed_s = abs(other.stamp_ns - one.stamp_ns) * 1e-9
-        return squared_distance(slow.velocity, slow.cov.ravel(), fast.velocity, fast.cov.ravel(), elapsed_s, self._walk)
+        slow, fast = slow._replace(stamp_ns=0), fast._replace(stamp_ns=abs(other.stamp_ns - one.stamp_ns))
+        return float(gate_velocities(*_columns([fast]), *_columns([slow]), self._walk, GATE).distance[0])
 
 
 def needed(velocity: Floats) -> int:

@@ -9,7 +9,6 @@ until it can be completed (`sonar_graph.navigation.dvl_screening.partial_beams`)
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sonar_graph.calibration import Calibration, Mounting
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints
@@ -80,9 +79,11 @@ class RowIntake:
         rows = self._in_time(dvl, self.dvl.stamps_ns, "dvl")
         if rows is None:
             return False
-        cov = in_numbers(rows.velocity_cov, self._default_cov)
-        is_sound = _positive_definite(cov) | np.isnan(rows.velocity_cov[:, 0, 0])
-        if not is_sound.all():
+        cov = rows.velocity_cov
+        if not _is_dominant(cov):
+            cov = in_numbers(cov, self._default_cov)
+            variances = np.linalg.eigvalsh(cov)
+            is_sound = (variances[:, 0] > ROUNDING * variances[:, 2]) | np.isnan(rows.velocity_cov[:, 0, 0])
             unsound = rows.stamps_ns[~is_sound].tolist()
             self._refused += [RefusedRow("dvl", stamp_ns, Refusal.UNSOUND, np.nan) for stamp_ns in unsound]
             if not is_sound.any():
@@ -141,12 +142,12 @@ class RowIntake:
         return rows
 
 
-def _positive_definite(cov: Floats) -> NDArray[np.bool_]:
-    """Mask of positive definite matrices (n, 3, 3), at once where each diagonal exceeds the rest of its row."""
-    if (np.abs(cov).sum(axis=2) < 2.0 * cov.diagonal(axis1=1, axis2=2)).all():
-        return np.ones(len(cov), np.bool_)
-    variances = np.linalg.eigvalsh(cov)
-    return np.asarray(variances[:, 0] > ROUNDING * variances[:, 2])
+def _is_dominant(cov: Floats) -> bool:
+    """True where each variance (n, 3, 3) exceeds the rest of its row: then all are finite and positive definite."""
+    return all(
+        abs(xy) + abs(xz) < xx < np.inf and abs(yx) + abs(yz) < yy < np.inf and abs(zx) + abs(zy) < zz < np.inf
+        for xx, xy, xz, yx, yy, yz, zx, zy, zz in cov.reshape(-1, 9).tolist()
+    )
 
 
 def _rotation(mounting: Mounting) -> Floats | None:
