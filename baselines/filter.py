@@ -178,7 +178,7 @@ class SonarModel(NamedTuple):
         """Covariances of detections: symmetric, and the calibration's where the log has none, shape (m, 2, 2)."""
         logged = detections.range_azimuth_cov
         R_z = 0.5 * (logged + logged.transpose(0, 2, 1))
-        if np.isnan(R_z).any():
+        if np.count_nonzero(np.isnan(R_z)):
             R_z[np.isnan(R_z).any(axis=(1, 2))] = self.R_z
         return R_z
 
@@ -437,13 +437,12 @@ class FilterShell(ABC):
             R_z = self.sonar.noise_of(detections)
             happening += [(stamp_ns, FRAME, stamp_ns) for stamp_ns in frames]
         events = in_order(happening, self.node_ns, self._opened_ns, self._interval_ns)
-        known_ns, _, _, starts_ns, ends_ns = np.array(events).T.copy()
+        known_ns, _, _, starts_ns, ends_ns = map(np.array, zip(*events, strict=True))
         motions = self.odometry.motions(starts_ns, ends_ns, known_ns, NO_BIAS)
         has_gap = np.isnan(motions.dp[:, 0]).tolist()
         has_rate = self._earth is not None or self.gyro_bias() is not None
-        for event, is_over_gap, *values in zip(events, has_gap, *motions, strict=True):
+        for event, is_over_gap, motion in zip(events, has_gap, map(Motion, *motions), strict=True):
             stamp_ns, kind, row, _, _ = event
-            motion = Motion(*values)
             if is_over_gap:
                 motion = self._over_gap(event, len(frames[row]) if kind == FRAME else int(kind == DEPTH))
             elif has_rate:

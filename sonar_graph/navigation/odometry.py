@@ -16,6 +16,8 @@ P is the growth of the error, so that successive motions, taken as independent, 
 docs/theory/preintegration.md, docs/theory/gaps.md.
 """
 
+from types import NoneType
+
 import numpy as np
 
 from sonar_graph.calibration import ROWS_BEFORE, Calibration
@@ -93,7 +95,7 @@ class Odometry:
         MeasurementError
             When the blocks are of another kind.
         """
-        if not (isinstance(imu, Imu | None) and isinstance(dvl, Dvl | None)):
+        if not (isinstance(imu, (Imu, NoneType)) and isinstance(dvl, (Dvl, NoneType))):
             raise MeasurementError(f"imu, dvl: expected Imu and Dvl, not {type(imu).__name__} and {type(dvl).__name__}")
         placed_imu = imu is not None and self._intake.add_imu(imu)
         placed_dvl = dvl is not None and self._intake.add_dvl(dvl)

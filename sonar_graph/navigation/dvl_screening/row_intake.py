@@ -137,7 +137,7 @@ class RowIntake:
             if later is None:
                 return None
             rows = later
-        if (rows.stamps_ns[1:] == rows.stamps_ns[:-1]).any():
+        if np.count_nonzero(rows.stamps_ns[1:] == rows.stamps_ns[:-1]):
             rows = rows.rows(np.unique(rows.stamps_ns, return_index=True)[1])
         return rows
 
