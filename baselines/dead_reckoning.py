@@ -7,7 +7,7 @@ import numpy as np
 
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.measurements import Floats, Measurements
-from sonar_graph.motion import MotionSource, PreintegratedMotion
+from sonar_graph.motion import MotionSource, PreintegratedMotion, require_source
 from sonar_graph.states import (
     CausalEstimates,
     DetectionJournal,
@@ -52,6 +52,7 @@ class DeadReckoning:
     def __init__(
         self, calibration: Calibration, odometry: MotionSource, params: DeadReckoningParams | None = None
     ) -> None:
+        require_source(odometry, calibration, "DeadReckoning(calibration, odometry, params)")
         self._params = params or DeadReckoningParams()
         self._odometry = odometry
         has_bias = calibration.imu.gyro_bias_sigma > 0

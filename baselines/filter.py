@@ -26,7 +26,7 @@ from pydantic import Field
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
 from sonar_graph.errors import EstimatorError, MeasurementError
 from sonar_graph.measurements import Floats, LandmarkDetections, Measurements
-from sonar_graph.motion import Motions, MotionSource
+from sonar_graph.motion import Motions, MotionSource, require_source
 from sonar_graph.navigation.alignment import earth_rate_in_world, tilt_sigma, up_direction
 from sonar_graph.numerics import block, compiled, cross, exp_and_mean, mat, store, vec
 from sonar_graph.slam.landmarks import gate_threshold, identify
@@ -264,6 +264,7 @@ class FilterShell(ABC):
     name: str
 
     def __init__(self, calibration: Calibration, odometry: MotionSource, params: FilterParams) -> None:
+        require_source(odometry, calibration, f"{type(self).__name__}(calibration, odometry, params)")
         self.calibration, self.odometry = calibration, odometry
         self.sonar = SonarModel.of(calibration, params.gate_probability)
         self.port = np.array(calibration.depth.port_m)

@@ -16,6 +16,8 @@ from typing import NamedTuple, Protocol
 
 import gtsam
 
+from sonar_graph.calibration import Calibration
+from sonar_graph.errors import CalibrationError
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints
 from sonar_graph.states import RefusedRow
 
@@ -70,6 +72,18 @@ class PreintegratedMotion:
     def corrected(self, bias: Floats) -> gtsam.Pose3:
         """i_T_j for another gyro bias, to first order: ``i_T_j Exp(D_bias (bias - self.bias))``."""
         return self.i_T_j.compose(gtsam.Pose3.Expmap(self.D_bias @ (bias - self.bias)))
+
+
+def require_source(odometry: object, calibration: Calibration, call: str) -> None:
+    """Raise a TypeError that names the ``call`` where an argument is no source of motion.
+
+    Also a `CalibrationError` where it says that it was made with another calibration than the estimator.
+    """
+    if isinstance(odometry, type) or not hasattr(odometry, "motions"):
+        given = odometry.__name__ if isinstance(odometry, type) else type(odometry).__name__
+        raise TypeError(f"{call}: expected a source of motion, such as Odometry(calibration), not {given}")
+    if getattr(odometry, "calibration", calibration) != calibration:
+        raise CalibrationError(f"{call}: the odometry was made with another calibration; make both with the same")
 
 
 class Motions(NamedTuple):

@@ -21,14 +21,14 @@ M = TypeVar("M", bound=BaseModel)
 def nested(values: dict[str, Any], start: dict[str, Any] | None = None) -> dict[str, Any]:
     """Settings in sections, from values by dotted names such as ``image.noise_db``, added to those of a start."""
     tree = deepcopy(start or {})
-    for name, value in values.items():
+    for name, value in sorted(values.items(), key=lambda named: named[0].count(".")):  # sections before their settings
         *sections, last = name.split(".")
         place = tree
         for section in sections:
             if not isinstance(place.get(section), dict):
                 place[section] = {}
             place = place[section]
-        place[last] = value
+        place[last] = deepcopy(value)
     return tree
 
 
@@ -152,7 +152,7 @@ def unknown_field(place: Place, model: type[BaseModel]) -> str:
     fields, inside = list(owner.section.model_fields), [setting.name for setting in settings_of(owner.section)]
     meant = [_path((*owner.names, *dotted.split("."))) for dotted in inside if dotted.endswith(f".{name}")]
     hint = f"; did you mean {meant[0]}?" if meant else suggestion(name, fields)
-    return f"{fault}{hint} {whose} has: {', '.join(fields)}"
+    return f"{fault}{hint} {whose} has: {', '.join(fields) or 'none'}"
 
 
 def choice(name: str, known: Iterable[str], owner: str = "") -> str:

@@ -65,6 +65,8 @@ class Odometry:
     """
 
     def __init__(self, calibration: Calibration) -> None:
+        self.calibration = calibration
+        """What it was made with."""
         self._intake = RowIntake(calibration)
         self._imu, self._dvl = self._intake.imu, self._intake.dvl
         self._hold_past = calibration.odometry_interpolation == "hold-past"

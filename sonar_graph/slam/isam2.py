@@ -21,7 +21,7 @@ from pydantic import model_validator
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.errors import CalibrationError, EstimatorError
 from sonar_graph.measurements import NS_PER_S, Floats, Ints, Measurements
-from sonar_graph.motion import MotionSource
+from sonar_graph.motion import MotionSource, require_source
 from sonar_graph.slam.estimates import AnchoredPose, PoseHistory
 from sonar_graph.slam.frontend import Frontend
 from sonar_graph.slam.keyframes import KeyframeParams, Keyframes
@@ -96,6 +96,7 @@ class Isam2:
                 f"isam2: params: expected Isam2Params or None, not {type(params).__name__}; of a dict:"
                 " Isam2Params(**params)"
             )
+        require_source(odometry, calibration, "Isam2(calibration, odometry, params)")
         noise = {
             "imu.gyro_noise_density": calibration.imu.gyro_noise_density,
             "dvl.velocity_sigma_m_s": min(calibration.dvl.velocity_sigma_m_s),

@@ -272,18 +272,22 @@ class Keyframes:
         until_ns = np.append(samples.stamps_ns[1:], node_ns)
         known_ns = np.full(len(samples), self.odometry.reached_ns(np.array([node_ns]))[0])
         motions = self.odometry.motions(samples.stamps_ns, until_ns, known_ns, bias)
-        up, port = self._attitude()[2], np.array(self.calibration.depth.port_m)
-        k_R_j, k_p_j = np.eye(3), np.zeros(3)
+        lost = np.flatnonzero(np.isnan(motions.dp[:, 0]))  # a gap shorter than what samples are carried over
+        first = int(lost[-1]) + 1 if len(lost) else 0
+        if first == len(samples):
+            return
+        up = self.smoother.values.atPose3(X(j)).rotation().matrix()[2]
+        port, k_R_j, k_p_j = np.array(self.calibration.depth.port_m), np.eye(3), np.zeros(3)
         ports, wander_m2 = np.empty((len(samples), 3)), np.empty(len(samples))
-        for k in reversed(range(len(samples))):
+        for k in reversed(range(first, len(samples))):
             up_k = k_R_j @ up
             wander_m2[k] = up_k @ motions.C[k, 3:, 3:] @ up_k
             k_R_j, k_p_j = motions.dR[k] @ k_R_j, motions.dp[k] + motions.dR[k] @ k_p_j
             ports[k] = k_R_j.T @ (port - k_p_j)
         variance = np.where(np.isnan(samples.variance_m2), self.calibration.depth.sigma_m**2, samples.variance_m2)
-        weights, mean_variance = weights_at_end(variance, wander_m2)
-        z_m = float(weights @ samples.z_m)
-        self.smoother.add({"depth": factors.depth(X(j), z_m, weights @ ports, mean_variance**0.5)})
+        weights, mean_variance = weights_at_end(variance[first:], wander_m2[first:])
+        z_m = float(weights @ samples.z_m[first:])
+        self.smoother.add({"depth": factors.depth(X(j), z_m, weights @ ports[first:], mean_variance**0.5)})
 
     def _constrain(self, j: int) -> None:
         if self.calibration.planar:

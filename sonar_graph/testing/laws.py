@@ -193,11 +193,14 @@ LIVE_COVARIANCE = 0.25
 
 
 def settings_have_defaults(make: MakeEstimator) -> None:
-    """``Params()`` can be made without arguments."""
+    """``Params()`` can be made without arguments, and a class takes them after calibration and odometry."""
+    calibration = small_world().calibration
     try:
-        fresh(make, small_world().calibration).Params()
+        params = fresh(make, calibration).Params()
+        if isinstance(make, type):
+            make(calibration, Odometry(calibration), params)
     except Exception as error:
-        raise ContractError(f"Params() fails: {error}") from error
+        raise ContractError(f"Params(), or make(calibration, odometry, params), fails: {error}") from error
 
 
 def knows_nothing_before_the_first_measurement(make: MakeEstimator) -> None:

@@ -185,13 +185,15 @@ def test_run_and_compare_name_what_was_refused_in_a_log(straight, tmp_path, caps
 
 def test_a_landmark_that_isam2_could_not_place_reaches_the_comparison(monkeypatch):
     sequence = simulate_mission(MissionOptions(duration_s=20.0, imu="mti1"))
-    placed = SightingFactors._placed
+    make = SightingFactors.make
     first = {int(sequence.detections.most_probable()[0][0])}
 
-    def without(self: SightingFactors, sighting: Any, key: int) -> Any:
-        return {} if {key} == {L(id_) for id_ in first} else placed(self, sighting, key)
+    def without(self: SightingFactors, sighting: Any, key: int, *, is_first: bool) -> Any:
+        made = make(self, sighting, key, is_first=is_first)
+        unplaced = {} if {key} != {L(id_) for id_ in first} else {"first direction", "floor prior"}
+        return {label: factor for label, factor in made.items() if label not in unplaced}
 
-    monkeypatch.setattr(SightingFactors, "_placed", without)
+    monkeypatch.setattr(SightingFactors, "make", without)
     (line, *_) = run_estimator(sequence, "isam2").withheld
     assert line.startswith("landmark ")
     assert line.endswith("; withheld")

@@ -9,11 +9,12 @@ from hypothesis import strategies as st
 from scipy.stats import chi2, multivariate_normal
 
 from sonar_graph.measurements import NO_TRACK, Floats, LandmarkDetections
+from sonar_graph.slam.landmarks import AmendableJournal
 from sonar_graph.slam.landmarks.association import identify
 from sonar_graph.slam.landmarks.joint_compatibility import UNPAIRED, Innovations, Pairing, believed, pair_jointly
 from sonar_graph.slam.landmarks.mixture import LEAST_LANDMARKS, IdentityPosterior, RecogniserErrors
 from sonar_graph.slam.landmarks.tracked import NO_LANDMARK, UNDECIDED, decide, second_rows_of_tracks
-from sonar_graph.states import DetectionJournal, Outcome
+from sonar_graph.states import Outcome
 
 from .made import detected
 
@@ -41,7 +42,7 @@ def test_the_most_probable_identity_is_accepted(rows: tuple, least: float, ids: 
 
 
 def test_a_row_is_amended_in_its_place_and_loses_its_innovation():
-    journal = DetectionJournal()
+    journal = AmendableJournal()
     rows = [journal.record(5, 2, Outcome.USED, np.ones(2), np.eye(2)), journal.record(6, 3, Outcome.WAITING)]
     assert rows == [0, 1]
     journal.amend(0, Outcome.MOVED, 7)

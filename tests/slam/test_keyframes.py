@@ -206,6 +206,50 @@ def test_depths_since_the_last_keyframe_become_one_factor_at_their_weighted_mean
     assert factor_of(keyframes, gtsam.GPSFactorArm).noiseModel().sigmas()[2] == pytest.approx(sigma)
 
 
+def test_depths_of_a_turning_vehicle_are_carried_by_its_motion():
+    """Mean port and sigma as from the exact path of a constant twist; the log's axes differ in noise."""
+    rate, velocity, port, bias = np.array([0.3, 0.1, -0.2]), np.array([0.5, 0.2, -0.1]), (0.4, -0.3, 0.2), 0.02
+    sigmas = np.array([0.002, 0.06, 0.004])
+    calibration = Calibration(
+        imu=ImuCalibration(gyro_noise_density=1e-9, gyro_bias_sigma=1e-9),
+        dvl=DvlCalibration(velocity_sigma_m_s=tuple(sigmas)),
+        depth=DepthCalibration(sigma_m=0.05, port_m=port),
+        start=Start(rpy_rad=(0.3, -0.2, 0.5)),
+        use_gravity=False,
+    )
+    when = np.arange(0.15, 2.0, 0.25)
+    keyframes = keyframes_of(calibration)
+    keyframes.bias = lambda _: np.array([bias, 0.0, 0.0])
+    keyframes.add(
+        level_imu(2.0, rate + np.array([bias, 0.0, 0.0])),
+        steady_dvl(2.0, velocity),
+        Depth(at(*when), when, np.full(len(when), np.nan)),
+    )
+    keyframes.advance(int(at(2.0)[0]))
+    (factor,) = factors_on(keyframes, gtsam.GPSFactorArm, X(1))
+
+    start, twist = calibration.start.pose(), np.r_[rate, velocity]
+    path = [start.compose(gtsam.Pose3.Expmap(twist * t)) for t in (*when, 2.0)]
+    q = []
+    for k, dt in enumerate(np.diff([*when, 2.0])):
+        ups = [
+            start.compose(gtsam.Pose3.Expmap(twist * (when[k] + u * dt))).rotation().matrix()[2] for u in (0.25, 0.75)
+        ]
+        q.append(np.mean([up**2 @ sigmas**2 for up in ups]) * 0.2 * dt)
+    weights, variance = weights_at_end(np.full(len(when), 0.05**2), np.array(q))
+    mean_port = weights @ [path[-1].transformTo(pose.transformFrom(np.array(port))) for pose in path[:-1]]
+    values = gtsam.Values()
+    for pose in (
+        gtsam.Pose3(),
+        gtsam.Pose3(gtsam.Rot3.Roll(np.pi / 2), np.zeros(3)),
+        gtsam.Pose3(gtsam.Rot3.Pitch(-np.pi / 2), np.zeros(3)),
+    ):
+        values.insert_or_assign(X(1), pose)
+        expected = (pose.transformFrom(mean_port))[2] - weights @ when
+        assert factor.unwhitenedError(values)[2] == pytest.approx(expected, abs=2e-4)
+    assert factor.noiseModel().sigmas()[2] == pytest.approx(variance**0.5, rel=0.03)
+
+
 def test_a_depth_carried_far_by_a_noisy_log_is_worth_less():
     """Vertical noise of 0.2 m/s at 5 Hz on a vehicle that points straight up: its x axis; for 1.5 s."""
     dvl = DvlCalibration(velocity_sigma_m_s=(0.2, 1e-7, 1e-7))

@@ -71,7 +71,7 @@ class RowIntake:
             return False
         rate, force = rows.angular_velocity, rows.specific_force
         if self._body_R_imu is not None:
-            rate, force = rate @ self._body_R_imu.T, force @ self._body_R_imu.T
+            rate, force = _turned(self._body_R_imu, rate), _turned(self._body_R_imu, force)
         return self.imu.insert(rows.stamps_ns, rate, force)
 
     def add_dvl(self, dvl: Dvl) -> bool:
@@ -83,7 +83,9 @@ class RowIntake:
         if not _is_dominant(cov):
             cov = in_numbers(cov, self._default_cov)
             variances = np.linalg.eigvalsh(cov)
-            is_sound = (variances[:, 0] > ROUNDING * variances[:, 2]) | np.isnan(rows.velocity_cov[:, 0, 0])
+            is_symmetric = (np.abs(cov - cov.transpose(0, 2, 1)) <= 1e-6 * variances[:, 2, None, None]).all(axis=(1, 2))
+            is_sound = is_symmetric & (variances[:, 0] > ROUNDING * variances[:, 2])
+            is_sound |= np.isnan(rows.velocity_cov[:, 0, 0])
             unsound = rows.stamps_ns[~is_sound].tolist()
             self._refused += [RefusedRow("dvl", stamp_ns, Refusal.UNSOUND, np.nan) for stamp_ns in unsound]
             if not is_sound.any():
@@ -91,7 +93,7 @@ class RowIntake:
             rows, cov = rows.rows(is_sound), cov[is_sound]
         velocity = rows.velocity
         if self._body_R_dvl is not None:
-            velocity, cov = velocity @ self._body_R_dvl.T, self._body_R_dvl @ cov @ self._body_R_dvl.T
+            velocity, cov = _turned(self._body_R_dvl, velocity), self._body_R_dvl @ cov @ self._body_R_dvl.T
         block, confirmation = (rows.stamps_ns, velocity, cov), self._confirmation
         result = self._gated(block)
         if confirmation is None:
@@ -148,6 +150,11 @@ def _is_dominant(cov: Floats) -> bool:
         abs(xy) + abs(xz) < xx < np.inf and abs(yx) + abs(yz) < yy < np.inf and abs(zx) + abs(zy) < zz < np.inf
         for xx, xy, xz, yx, yy, yz, zx, zy, zz in cov.reshape(-1, 9).tolist()
     )
+
+
+def _turned(R: Floats, rows: Floats) -> Floats:
+    """``R v`` of each row; a product of matrices would round differently for blocks of different length."""
+    return np.einsum("ij,nj->ni", R, rows)
 
 
 def _rotation(mounting: Mounting) -> Floats | None:
