@@ -7,31 +7,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from baselines import invariant_equations as equations
 from baselines.filter import FilterParams, FilterShell, Motion, far_view, is_inside, polar_covariance
-from baselines.invariant_equations import (
-    BARE,
-    BETA,
-    BODY,
-    EYE,
-    THETA,
-    UP,
-    InvariantState,
-    augmented,
-    correct,
-    hat,
-    height_of_body_point,
-    height_of_point,
-    innovation_covariance,
-    landmark_covariance,
-    location,
-    observation,
-    place_of,
-    pose,
-    pose_covariance,
-    predict,
-    symmetric,
-    up_innovation,
-)
+from baselines.invariant_equations import BARE, BETA, BODY, EYE, THETA, UP, InvariantState
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
 from sonar_graph.measurements import Floats
 from sonar_graph.motion import MotionSource
@@ -92,19 +70,19 @@ class InvariantEkf(FilterShell):
 
     def predict(self, motion: Motion, duration_s: float) -> None:
         """Carry the state over the motion to the next epoch, (2) and (3)."""
-        predict(self._state, motion, self._walk_density**2 * duration_s)
+        equations.predict(self._state, motion, self._walk_density**2 * duration_s)
 
     def correct_up(self, up: Floats, sigma: float) -> None:
         """Update by the world's up in the body, shape (3,), with the sigma of its tilt, rad, (8)."""
-        y, H = up_innovation(self._state, up)
-        correct(self._state, *innovation_covariance(self._state, H, sigma**2 * np.eye(2)), y)
+        y, H = equations.up_innovation(self._state, up)
+        equations.correct(self._state, *equations.innovation_covariance(self._state, H, sigma**2 * np.eye(2)), y)
 
     def correct_height(self, k: int, z_m: float, variance_m2: float, gate: float = np.inf) -> None:
         """Update by the height of the body (k = 0) or a landmark within a gate, (7)."""
-        height_m, H = height_of_point(self._state, k)
-        HP, S = innovation_covariance(self._state, H, np.full((1, 1), variance_m2))
+        height_m, H = equations.height_of_point(self._state, k)
+        HP, S = equations.innovation_covariance(self._state, H, np.full((1, 1), variance_m2))
         if (z_m - height_m) ** 2 <= gate * S[0, 0]:
-            correct(self._state, HP, S, np.array([z_m - height_m]))
+            equations.correct(self._state, HP, S, np.array([z_m - height_m]))
 
     def correct_plane(self, plane: PlanarMotion) -> None:
         """Update by the plane on which the vehicle stays: height and tilt."""
@@ -113,9 +91,9 @@ class InvariantEkf(FilterShell):
 
     def correct_depth(self, motion: Motion, z_m: float, variance_m2: float) -> None:
         """Update by the height of the pressure port a motion after the state, (7)."""
-        height_m, H, H_m = height_of_body_point(self._state, motion, self.port)
-        HP, S = innovation_covariance(self._state, H, H_m @ motion.C @ H_m.T + variance_m2)
-        correct(self._state, HP, S, np.array([z_m - height_m]))
+        height_m, H, H_m = equations.height_of_body_point(self._state, motion, self.port)
+        HP, S = equations.innovation_covariance(self._state, H, H_m @ motion.C @ H_m.T + variance_m2)
+        equations.correct(self._state, HP, S, np.array([z_m - height_m]))
 
     def observe(
         self, motion: Motion, slot: int, z: Floats, R_z: Floats, *, may_be_far: bool
@@ -123,42 +101,42 @@ class InvariantEkf(FilterShell):
         """Update by range and azimuth of a known landmark, (5), or the point seen where it may be far away, (6)."""
         state, k = self._state, 1 + slot
         if may_be_far:
-            x, G, G_m, G_z = location(state, motion, self.sonar, z, 0.0)
+            x, G, G_m, G_z = equations.location(state, motion, self.sonar, z, 0.0)
             # Exp(theta) turns both points: what is missed is xi_k - xi_new, without theta however far they are apart
             missed, H = x - state.points[k], -G
-            H[:, place_of(k)] += EYE
-            HP, S = innovation_covariance(state, H, G_m @ motion.C @ G_m.T)
+            H[:, equations.place_of(k)] += EYE
+            HP, S = equations.innovation_covariance(state, H, G_m @ motion.C @ G_m.T)
             view = far_view(missed, S, G_z, self.sonar, z, R_z)
             if view is not None:
                 S, e, S_view = view
                 is_used = is_inside(e, S_view, self.sonar.gate)
                 if is_used:
-                    correct(state, HP, S, missed)
+                    equations.correct(state, HP, S, missed)
                 return is_used, e, S_view
-        predicted, H, H_m = observation(state, k, motion, self.sonar)
+        predicted, H, H_m = equations.observation(state, k, motion, self.sonar)
         e = z - predicted
         e[1] = wrap_angle(e[1])
-        HP, S = innovation_covariance(state, H, H_m @ motion.C @ H_m.T + R_z)
+        HP, S = equations.innovation_covariance(state, H, H_m @ motion.C @ H_m.T + R_z)
         is_used = is_inside(e, S, self.sonar.gate)
         if is_used:
-            correct(state, HP, S, e)
+            equations.correct(state, HP, S, e)
         return is_used, e, S
 
     def augment(self, motion: Motion, z: Floats, R_z: Floats) -> None:
         """Append a landmark seen for the first time, (6), on a floor of known height within the floor's gate."""
-        elevation_rad = self.sonar.elevation_of_new(*pose(self._state, motion), z)
-        x, G, G_m, G_z = location(self._state, motion, self.sonar, z, elevation_rad)
+        elevation_rad = self.sonar.elevation_of_new(*equations.pose(self._state, motion), z)
+        x, G, G_m, G_z = equations.location(self._state, motion, self.sonar, z, elevation_rad)
         view = polar_covariance(R_z, self.sonar.aperture_rad)
-        self._state = augmented(self._state, x, G, G_m @ motion.C @ G_m.T + G_z @ view @ G_z.T)
+        self._state = equations.augmented(self._state, x, G, G_m @ motion.C @ G_m.T + G_z @ view @ G_z.T)
         self.correct_height(len(self._state.points) - 1, self.sonar.floor_z_m, self.sonar.floor_variance_m2, FLOOR_GATE)
 
     def pose_after(self, motion: Motion) -> tuple[Floats, Floats, Floats]:
         """world_R_body (3, 3), position (3,), and covariance of [theta, rho] (6, 6) a motion after the state."""
-        return *pose(self._state, motion), pose_covariance(self._state, motion)
+        return *equations.pose(self._state, motion), equations.pose_covariance(self._state, motion)
 
     def landmark(self, slot: int) -> tuple[Floats, Floats]:
         """Position, and covariance of its coordinates."""
-        return self._state.points[1 + slot], landmark_covariance(self._state, 1 + slot)
+        return self._state.points[1 + slot], equations.landmark_covariance(self._state, 1 + slot)
 
 
 def start_state(calibration: Calibration) -> InvariantState:
@@ -169,7 +147,7 @@ def start_state(calibration: Calibration) -> InvariantState:
     start = calibration.start
     R, X = start.pose().rotation().matrix(), np.array(start.position_m)
     A, P = np.zeros((BARE, 6)), np.zeros((BARE, BARE))
-    A[THETA, :3], A[BODY, :3], A[BODY, 3:] = R, hat(X) @ R, EYE
+    A[THETA, :3], A[BODY, :3], A[BODY, 3:] = R, equations.hat(X) @ R, EYE
     P = A @ np.diag(np.square((*start.rpy_sigma_rad, *start.position_sigma_m))) @ A.T
     P[BETA, BETA] = EYE * calibration.imu.gyro_bias_sigma**2
-    return InvariantState(R, X[None].copy(), np.zeros(3), symmetric(P))
+    return InvariantState(R, X[None].copy(), np.zeros(3), equations.symmetric(P))

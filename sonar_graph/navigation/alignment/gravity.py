@@ -8,13 +8,7 @@ change of velocity plus gravity's reaction. With the velocity v of the IMU's poi
     sigma^2 = (accel_noise^2 / T + 2 sigma_v^2 / T^2) / g^2 + N^2 T / 3 + sigma_b^2 T^2 / 4 + beta^2 max(1, tau / T)
 
 The bias of the accelerometers, ``beta = accel_bias / g``, does not average out over successive directions:
-``tau = (beta / N)^2`` keeps a filtered tilt from claiming less. It does not make it consistent (its true variance is
-1.5 times the claimed one, that of a smoothed tilt 2.5 times, by the scalar model): only the bias as a state would. A
-gyro also measures the Earth's rotation; in a world with x east and y north, at latitude phi, n the north in body axes::
-
-    body_R_world Omega = Omega sin(phi) up + Omega cos(phi) n
-
-Derivation: docs/theory/alignment.md.
+``tau = (beta / N)^2`` keeps a filtered tilt from claiming less. docs/theory/alignment.md.
 """
 
 import math
