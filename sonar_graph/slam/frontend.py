@@ -93,7 +93,7 @@ class Frontend:
         open_ = [row for row, why in enumerate(refusals) if why is None]
         if not open_:
             return None
-        seen = frame.rows(np.array(open_))
+        seen = frame if len(open_) == len(frame) else frame.rows(np.array(open_))
         return SeenFrame(seen, [rows[row] for row in open_], self._keyframes, self.landmarks.factors)
 
     def smoothed(self) -> Solution:

@@ -273,21 +273,19 @@ class Keyframes:
         known_ns = np.full(len(samples), self.odometry.reached_ns(np.array([node_ns]))[0])
         motions = self.odometry.motions(samples.stamps_ns, until_ns, known_ns, bias)
         lost = np.flatnonzero(np.isnan(motions.dp[:, 0]))  # a gap shorter than what samples are carried over
-        first = int(lost[-1]) + 1 if len(lost) else 0
-        if first == len(samples):
+        first, n = int(lost[-1]) + 1 if len(lost) else 0, len(samples)
+        if first == n:
             return
-        up = self.smoother.values.atPose3(X(j)).rotation().matrix()[2]
-        port, k_R_j, k_p_j = np.array(self.calibration.depth.port_m), np.eye(3), np.zeros(3)
-        ports, wander_m2 = np.empty((len(samples), 3)), np.empty(len(samples))
-        for k in reversed(range(first, len(samples))):
-            up_k = k_R_j @ up
-            wander_m2[k] = up_k @ motions.C[k, 3:, 3:] @ up_k
-            k_R_j, k_p_j = motions.dR[k] @ k_R_j, motions.dp[k] + motions.dR[k] @ k_p_j
-            ports[k] = k_R_j.T @ (port - k_p_j)
+        k_R_j, k_p_j = np.tile(np.eye(3), (n + 1, 1, 1)), np.zeros((n + 1, 3))
+        for k in reversed(range(first, n)):
+            k_R_j[k], k_p_j[k] = motions.dR[k] @ k_R_j[k + 1], motions.dp[k] + motions.dR[k] @ k_p_j[k + 1]
+        ups = k_R_j[first + 1 :] @ self.smoother.values.atPose3(X(j)).rotation().matrix()[2]
+        wander_m2 = np.einsum("ka,kab,kb->k", ups, motions.C[first:, 3:, 3:], ups)
         variance = np.where(np.isnan(samples.variance_m2), self.calibration.depth.sigma_m**2, samples.variance_m2)
-        weights, mean_variance = weights_at_end(variance[first:], wander_m2[first:])
+        weights, mean_variance = weights_at_end(variance[first:], wander_m2)
+        ports = np.einsum("kba,kb->ka", k_R_j[first:n], np.array(self.calibration.depth.port_m) - k_p_j[first:n])
         z_m = float(weights @ samples.z_m[first:])
-        self.smoother.add({"depth": factors.depth(X(j), z_m, weights @ ports[first:], mean_variance**0.5)})
+        self.smoother.add({"depth": factors.depth(X(j), z_m, weights @ ports, mean_variance**0.5)})
 
     def _constrain(self, j: int) -> None:
         if self.calibration.planar:

@@ -151,7 +151,8 @@ class TrackedIdentities:
         refusals = second_rows_of_tracks(frame, {number: track.identity for number, track in self._tracks.items()})
         kept = [row for row, why in enumerate(refusals) if why is None]
         may_wait = (frame.track != NO_TRACK) | (unnamed(frame) & (self._nameless is not None))
-        said = identify(frame.rows(np.array(kept)), self._minimum_probability)
+        once = frame if len(kept) == len(frame) else frame.rows(np.array(kept))
+        said = identify(once, self._minimum_probability)
         for row, why in zip(kept, said.refusals, strict=True):
             refusals[row] = None if may_wait[row] else why
         return refusals
