@@ -4,8 +4,9 @@ Epochs. The stamps of the DVL rows are *epochs*: between two epochs the velocity
 is final. An epoch counts as reached at time t when its own row and an IMU row at or after it are stamped at or before
 t. What happens between epochs (a detection, a depth sample, an estimate) is related to the newest reached epoch by a
 provisional motion that uses nothing stamped later. Results therefore depend on stamps alone, not on how a log is cut
-into blocks. One exception: where rows are added long before they are used, the first velocities, and those after a long
-gap, are epochs once later ones have confirmed them (`sonar_graph.navigation.dvl_screening.dvl_gate`).
+into blocks. Two exceptions, where rows are added long before they are used: the first velocities, and those after a
+long gap, are epochs once later ones have confirmed them, and rows of too few beams once a whole one has completed them
+(`sonar_graph.navigation.dvl_screening`).
 
 Gaps. A gap between two epochs is bridged with both its ends known. In a gap that lasts, both instants are reached from
 the epoch at which bottom lock was lost::
