@@ -87,12 +87,11 @@ def hole_ns(stamps: Ints, rows: int, row: int, until_ns: int) -> int:
     return length_ns if length_ns > (HOLE_INTERVALS * typical if typical > 0 else UNTYPICAL_NS) else 0
 
 
-@compiled
 def row_after_hole(stamps: Ints, first: int, last: int, longest_ns: int) -> int:
     """The row after the first hole between two rows that lasts longer; -1 where there is none."""
-    for row in range(first + 1, last + 1):
-        if stamps[row] - stamps[row - 1] > longest_ns and hole_ns(stamps, len(stamps), row, stamps[row]) > 0:
-            return row
+    for row in (first + 1 + np.flatnonzero(np.diff(stamps[first : last + 1]) > longest_ns)).tolist():
+        if hole_ns(stamps, len(stamps), row, stamps[row]) > 0:
+            return int(row)
     return -1
 
 
