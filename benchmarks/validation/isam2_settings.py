@@ -31,7 +31,7 @@ from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import BasinOptions, MissionOptions, simulate_basin, simulate_mission
 from sonar_graph.slam import Isam2, Isam2Params
-from sonar_graph.slam.smoother import Smoother, solve
+from sonar_graph.slam.smoother import Changed, Smoother, solve
 
 RATE_HZ, LONG_S, SHORT_S = 2.0, 600.0, 300.0
 ALONE = {"lag_s": 1e6, "waiting_gain": 0.0, "stale_shift_m": 1e3}
@@ -57,10 +57,10 @@ def run(sequence: Sequence, settings: dict[str, Any]) -> tuple[Isam2, int, float
     """The estimator at the end, how often its window was updated, and CPU seconds."""
     updates, update = 0, Smoother.update
 
-    def counted(smoother: Smoother, time_s: float) -> None:
+    def counted(smoother: Smoother, time_s: float) -> Changed:
         nonlocal updates
         updates += 1
-        update(smoother, time_s)
+        return update(smoother, time_s)
 
     estimator = Isam2(sequence.calibration, Odometry(sequence.calibration), Isam2Params(**settings))
     pieces = list(sequence.replay(sequence.instants(RATE_HZ)))
