@@ -74,9 +74,6 @@ def predict(x: Floats, P: Floats, dR_: Floats, dp_: Floats, C: Floats) -> None:
             P[r, c] = P[c, r]
 
 
-# -------------------------------------------------------------------------------- the pose after a motion
-
-
 @compiled
 def body_after(x: Floats, dR_: Floats, dp_: Floats) -> tuple[Floats, Floats, Floats]:
     """R' (3, 3), X' (3,) and T (6, 6) of the pose after a motion."""
@@ -91,11 +88,13 @@ def body_after(x: Floats, dR_: Floats, dp_: Floats) -> tuple[Floats, Floats, Flo
     return R_after, X_after, T
 
 
-def pose_after(x: Floats, P: Floats, motion: Motion) -> tuple[Floats, Floats, Floats]:
+@compiled
+def pose_after(x: Floats, P: Floats, dR: Floats, dp: Floats, C: Floats) -> tuple[Floats, Floats, Floats]:
     """Pose of the body a motion after the state: R' (3, 3), X' (3,), and the covariance ``T P_vv T^T + C`` of delta."""
-    R, X, T = body_after(x, motion.dR, motion.dp)
-    cov = T @ P[:POSE, :POSE] @ T.T + motion.C
-    return R, X, 0.5 * (cov + cov.T)
+    (R, X, T_), out = body_after(x, dR, dp), np.empty((6, 6))
+    T = mat6(T_)
+    store6(T @ mat6(P) @ T.T + mat6(C), out)
+    return R, X, out
 
 
 @inlined
@@ -206,6 +205,7 @@ def correct_number(x: Floats, P: Floats, k: int, value: float, variance: float) 
     correct(x, P, U, S, e)
 
 
+@compiled
 def correct_up(x: Floats, P: Floats, up: Floats, sigma: float) -> None:
     """Update roll and pitch by the direction of the world's up in the body, with the sigma of its tilt (rad)."""
     level = math.hypot(up[1], up[2])

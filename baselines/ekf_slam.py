@@ -10,15 +10,68 @@ import gtsam
 import numpy as np
 
 from baselines import ekf_equations
-from baselines.ekf_equations import LANDMARK, POSE
-from baselines.filter import FilterParams, FilterShell, Motion
+from baselines.ekf_equations import LANDMARK, POSE, correct_depth, observe, predict
+from baselines.filter import (
+    DEPTH,
+    EPOCH,
+    FRAME,
+    GATED,
+    NO_BIAS,
+    OPEN,
+    USED,
+    Events,
+    FilterParams,
+    FilterShell,
+    Motion,
+    SonarModel,
+    add_force,
+    corrected,
+)
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats
 from sonar_graph.motion import MotionSource
+from sonar_graph.numerics import compiled, rotation_from_euler, vec
 
 SINGULAR_COSINE = 1e-3
 """Below this cosine of the pitch the Euler angles are taken as singular."""
+
+
+@compiled
+def advance(
+    x: Floats, P: Floats, i_R_j: Floats, impulse: Floats, earth: Floats, port: Floats, sonar: SonarModel,
+    events: Events, k: int,
+) -> int:  # fmt: skip
+    """Use events from k on, up to a gap, a landmark that is new or may be far, or an event of another kind."""
+    (dR, dp, C, D, force), views = events.motions, events.views
+    while not math.isnan(dp[k, 0]):
+        kind, row = events.kind[k], events.row[k]
+        if events.has_rate[k]:
+            earth_i = rotation_from_euler(vec(x[3:])).T @ vec(earth)
+            dR[k], dp[k], force[k] = corrected(dR[k], dp[k], D[k], force[k], NO_BIAS, earth_i)
+            events.has_rate[k] = False
+        if kind == EPOCH:
+            predict(x, P, dR[k], dp[k], C[k])
+            add_force(i_R_j, impulse, dR[k], force[k])
+        elif kind == DEPTH:
+            correct_depth(x, P, dR[k], dp[k], C[k], port, events.z_m[row], events.variance_m2[row])
+        elif kind == FRAME:
+            while row < len(views.stamp_ns) and views.stamp_ns[row] == events.stamp_ns[k]:
+                if views.outcome[row] == OPEN:
+                    if views.landmark[row] < 0:
+                        return k
+                    is_used, views.e[row], views.S[row] = observe(
+                        x, P, POSE + LANDMARK * views.landmark[row], dR[k], dp[k], C[k],
+                        sonar.body_R_sonar, sonar.body_p_sonar, views.z[row], views.R_z[row], sonar.gate,
+                    )  # fmt: skip
+                    views.outcome[row] = USED if is_used else GATED
+                row += 1
+        else:
+            break
+        k += 1
+        if math.cos(x[4]) < SINGULAR_COSINE:
+            break
+    return k
 
 
 class EkfSlamParams(FilterParams):
@@ -65,20 +118,21 @@ class EkfSlam(FilterShell):
         """Stamp (ns), x of equation (4) and P of (5) at the newest epoch; copies."""
         return self.node_ns, self._x.copy(), self._P.copy()
 
-    def predict(self, motion: Motion, duration_s: float) -> None:  # noqa: ARG002
-        """Carry the state over the motion to the next epoch.
+    def advance(self, events: Events, k: int) -> int:
+        """Predict over epochs and correct by depth, from event k on.
 
         Raises
         ------
         EstimatorError
             When the pitch comes so near 90 degrees that the Euler angles are singular.
         """
-        ekf_equations.predict(self._x, self._P, motion.dR, motion.dp, motion.C)
+        k = advance(self._x, self._P, self.turned, self.impulse, self.earth, self.port, self.sonar, events, k)
         if math.cos(self._x[4]) < SINGULAR_COSINE:
             raise EstimatorError(
-                f"ekf-slam: pitch is {math.degrees(self._x[4]):.2f} deg at {self.node_ns} ns, where the Euler angles"
-                " of its state are singular; use isam2 for this log"
+                f"ekf-slam: pitch is {math.degrees(self._x[4]):.2f} deg at {events.start_ns[k]} ns, where the Euler"
+                " angles of its state are singular; use isam2 for this log"
             )
+        return k
 
     def correct_up(self, up: Floats, sigma: float) -> None:
         """Update roll and pitch by the world's up in the body."""
@@ -90,10 +144,6 @@ class EkfSlam(FilterShell):
         for k, (value, sigma) in enumerate([(plane.z_m, plane.z_sigma_m), tilt, tilt], start=2):
             ekf_equations.correct_number(self._x, self._P, k, value, sigma**2)
 
-    def correct_depth(self, motion: Motion, z_m: float, variance_m2: float) -> None:
-        """Update by the height of the pressure port."""
-        ekf_equations.correct_depth(self._x, self._P, motion.dR, motion.dp, motion.C, self.port, z_m, variance_m2)
-
     def observe(
         self, motion: Motion, slot: int, z: Floats, R_z: Floats, *, may_be_far: bool
     ) -> tuple[bool, Floats, Floats]:
@@ -102,9 +152,7 @@ class EkfSlam(FilterShell):
         if may_be_far and (told := ekf_equations.observe_far(self._x, self._P, at, motion, sonar, z, R_z)) is not None:
             return told
         dR, dp, C, _, _ = motion
-        return ekf_equations.observe(
-            self._x, self._P, at, dR, dp, C, sonar.body_R_sonar, sonar.body_p_sonar, z, R_z, sonar.gate
-        )
+        return observe(self._x, self._P, at, dR, dp, C, sonar.body_R_sonar, sonar.body_p_sonar, z, R_z, sonar.gate)
 
     def augment(self, motion: Motion, z: Floats, R_z: Floats) -> None:
         """Append a landmark to (4) and (5)."""
@@ -112,7 +160,7 @@ class EkfSlam(FilterShell):
 
     def pose_after(self, motion: Motion) -> tuple[Floats, Floats, Floats]:
         """world_R_body (3, 3), position (3,), and covariance of [theta, rho] (6, 6) a motion after the state."""
-        return ekf_equations.pose_after(self._x, self._P, motion)
+        return ekf_equations.pose_after(self._x, self._P, motion.dR, motion.dp, motion.C)
 
     def landmark(self, slot: int) -> tuple[Floats, Floats]:
         """Position, and its block of (5)."""

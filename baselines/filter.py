@@ -21,17 +21,19 @@ from typing import NamedTuple
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
-from sonar_graph.errors import EstimatorError, MeasurementError
-from sonar_graph.measurements import Floats, LandmarkDetections, Measurements
+from sonar_graph.errors import EstimatorError
+from sonar_graph.measurements import Floats, Ints, LandmarkDetections, Measurements
 from sonar_graph.motion import Motions, MotionSource, require_source
 from sonar_graph.navigation.alignment import earth_rate_in_world, tilt_sigma, up_direction
 from sonar_graph.numerics import block, compiled, cross, exp_and_mean, mat, store, vec
 from sonar_graph.slam.landmarks import gate_threshold, identify
 from sonar_graph.slam.models import elevation_on_floor
 from sonar_graph.states import (
+    OUTCOME_NUMBERS,
     CausalEstimates,
     DetectionJournal,
     DetectionLog,
@@ -80,38 +82,100 @@ def corrected(
     return turned, moved, pushed
 
 
-EPOCH, DEPTH, FRAME, END, GRAVITY = range(5)
-"""Kinds of events; at equal stamps the lower comes first, and `GRAVITY` right after its epoch."""
+@compiled
+def add_force(i_R_j: Floats, impulse: Floats, dR: Floats, more: Floats) -> None:
+    """Continue an interval of gravity by a motion: rotation, and specific force summed up in the frame of its start."""
+    R = mat(i_R_j)
+    impulse[0], impulse[1], impulse[2] = vec(impulse) + R @ vec(more)
+    store(R @ mat(dR), i_R_j, 0, 0)
 
 
-class Event(NamedTuple):
-    """An epoch, a depth sample, the detections of a frame, the end of a call, or of an interval of gravity."""
-
-    stamp_ns: int
-    """When it happens; no row stamped later is used."""
-    kind: int
-    row: int
-    """Of the depth sample or frame; the stamp of an epoch."""
-    start_ns: int
-    """Epoch at which its motion begins."""
-    end_ns: int
+EPOCH, PLANE, GRAVITY, DEPTH, FRAME, END = range(6)
+"""Kinds of events; at equal stamps the lower comes first, but plane and gravity right after their epoch."""
+USED, GATED, NEW = (OUTCOME_NUMBERS[outcome] for outcome in (Outcome.USED, Outcome.GATED, Outcome.NEW))
+NOT_STARTED, LONG_AGO = int(np.iinfo(np.int64).max), int(np.iinfo(np.int64).min)
+OPEN = -1
+"""In place of an outcome: the detection is to be used."""
 
 
-def in_order(happening: list[tuple[int, int, int]], node_ns: int, opened_ns: int, interval_ns: int) -> list[Event]:
-    """Events in their order, each with its motion from the newest epoch; gravity's from the one where it was last used.
+class Views(NamedTuple):
+    """Detections of a call: range and azimuth z (m, 2) with covariance R_z, innovation e with S (NaN without one)."""
 
-    ``happening``: stamp, kind and row, in any order; ``node_ns``, ``opened_ns``: epochs of the state and at which
-    the interval of gravity began; ``interval_ns``: least length of such an interval, 0 for none.
+    stamp_ns: Ints
+    landmark: Ints
+    """Number of the landmark in the state; -1 for one that may be new, or far from where it is predicted."""
+    z: Floats
+    R_z: Floats
+    outcome: NDArray[np.int8]
+    """`OUTCOME_NUMBERS`, or OPEN."""
+    e: Floats
+    S: Floats
+
+
+def open_rows(views: Views, first: int) -> list[int]:
+    """Detections of a frame that are to be used, of which one is given."""
+    is_open = (views.stamp_ns == views.stamp_ns[first]) & (views.outcome == OPEN)
+    return np.flatnonzero(is_open).tolist()
+
+
+class Events(NamedTuple):
+    """Events of a call in their order, as columns."""
+
+    stamp_ns: Ints
+    """When they happen; no row stamped later is used."""
+    start_ns: Ints
+    """Newest epoch, at which the motion to an event begins, and the instant at which it ends."""
+    end_ns: Ints
+    kind: Ints
+    row: Ints
+    """Number of the depth sample, or of the first detection of the frame."""
+    motions: Motions
+    """All NaN over a gap, until that is bridged."""
+    has_rate: NDArray[np.bool_]
+    """True where a gyro bias and the Earth's rate are still in a motion."""
+    z_m: Floats
+    """Depth samples, with their variances; then the detections."""
+    variance_m2: Floats
+    views: Views
+
+
+@compiled
+def in_order(
+    epochs_ns: Ints, reached_ns: Ints, depth_ns: Ints, views: Views, since_ns: int,
+    end_ns: int, node_ns: int, opened_ns: int, interval_ns: int, is_planar: bool, out: Ints,
+) -> int:  # fmt: skip
+    """Write the first five columns of `Events` into the rows of ``out``, up to the end of a call; their number.
+
+    Parameters
+    ----------
+    since_ns
+        Depth samples stamped earlier are passed over, and detections that are not open.
+    node_ns, opened_ns, interval_ns
+        Epochs of the state and at which the interval of gravity began, and its least length; 0: no gravity.
     """
-    events = []
-    for stamp_ns, kind, row in sorted(happening):
-        events.append(Event(stamp_ns, kind, row, node_ns, row if kind == EPOCH else stamp_ns))
-        if kind == EPOCH:
-            node_ns = row
-            if 0 < interval_ns <= node_ns - opened_ns:
-                events.append(Event(stamp_ns, GRAVITY, row, opened_ns, node_ns))
-                opened_ns = node_ns
-    return events
+    n, e, d, r, kind, stamp_ns, frame_ns = 0, 0, 0, 0, END, LONG_AGO, LONG_AGO
+    while n == 0 or kind != END:
+        if kind == EPOCH and is_planar:
+            kind, until_ns = PLANE, node_ns
+        elif kind <= PLANE and 0 < interval_ns <= node_ns - opened_ns:
+            kind, until_ns, opened_ns = GRAVITY, node_ns, node_ns
+        else:
+            while d < len(depth_ns) and depth_ns[d] < since_ns:
+                d += 1
+            while r < len(views.stamp_ns) and (views.stamp_ns[r] == frame_ns or views.outcome[r] != OPEN):
+                r += 1
+            stamp_ns, until_ns, kind, row = end_ns, end_ns, END, 0
+            if r < len(views.stamp_ns):
+                stamp_ns, until_ns, kind, row = views.stamp_ns[r], views.stamp_ns[r], FRAME, r
+            if d < len(depth_ns) and depth_ns[d] <= stamp_ns:
+                stamp_ns, until_ns, kind, row = depth_ns[d], depth_ns[d], DEPTH, d
+            if e < len(epochs_ns) and reached_ns[e] <= stamp_ns:
+                stamp_ns, until_ns, kind, row = reached_ns[e], epochs_ns[e], EPOCH, e
+            e, d = e + int(kind == EPOCH), d + int(kind == DEPTH)
+            frame_ns = stamp_ns if kind == FRAME else frame_ns
+        out[0, n], out[1, n], out[2, n], out[3, n], out[4, n] = stamp_ns, node_ns, until_ns, kind, row
+        node_ns, n = until_ns if kind == EPOCH else node_ns, n + 1
+    return n
 
 
 # ------------------------------------------------------------------------------------------------- update, detections
@@ -236,24 +300,11 @@ def far_view(
     return cov, B @ missed, B @ cov @ B.T
 
 
-def check_rows(measurements: Measurements) -> None:
-    """Refuse detections and depth samples stamped after ``end_ns``, which only a mistake of the caller can explain."""
-    end_ns = measurements.end_ns
-    for rows in (measurements.detections, measurements.depth):
-        if rows is not None and rows.stamps_ns[-1] > end_ns:
-            raise MeasurementError(
-                f"Measurements: {type(rows).__name__} has a row at {rows.stamps_ns[-1]} ns, after end_ns = {end_ns};"
-                " hand it in with the call that reaches it"
-            )
-
-
 # ------------------------------------------------------------------------------------------------- the shell
 
-Told = tuple[Outcome, Floats | None, Floats | None]
-"""Outcome of a detection, with innovation (2,) and its covariance (2, 2) where there was a prediction."""
-NO_VIEWS = np.empty((0, 2)), np.empty((0, 2, 2))
-NOT_STARTED, LONG_AGO = int(np.iinfo(np.int64).max), int(np.iinfo(np.int64).min)
-NO_BIAS, NO_RATE = np.zeros(3), np.zeros(3)
+NO_BIAS, NO_STAMPS, NO_DEPTH = np.zeros(3), np.empty(0, np.int64), np.empty(0)
+NO_PAIRS, NO_COV = np.empty((0, 2)), np.empty((0, 2, 2))
+NO_VIEWS = Views(NO_STAMPS, NO_STAMPS, NO_PAIRS, NO_COV, np.empty(0, np.int8), NO_PAIRS, NO_COV)
 KEPT_NS = 10_000_000_000
 """Rows of this time may be kept longer than needed: dropping them costs as much as keeping a few."""
 
@@ -268,14 +319,16 @@ class FilterShell(ABC):
         self.calibration, self.odometry = calibration, odometry
         self.sonar = SonarModel.of(calibration, params.gate_probability)
         self.port = np.array(calibration.depth.port_m)
-        self._minimum_id_probability, self._earth = params.minimum_id_probability, earth_rate_in_world(calibration)
+        self._minimum_id_probability, earth = params.minimum_id_probability, earth_rate_in_world(calibration)
+        self.earth, self._has_rate = np.zeros(3) if earth is None else earth, self.has_bias or earth is not None
         self._plane, self._depth_variance = calibration.planar, calibration.depth.sigma_m**2
         self._interval_ns = round(params.gravity_interval_s * 1e9) if calibration.use_gravity else 0
         self.node_ns = 0
         """Stamp of the newest epoch, that of the state."""
         self._reached_ns, self._done_ns = NOT_STARTED, LONG_AGO
-        self._opened_ns, self._opened_velocity, self._opened_R, self._kept_ns = 0, (np.zeros(3), 0.0), np.eye(3), 0
-        self._in_gap = {DEPTH: 0, FRAME: 0}
+        self._opened_ns, self._opened_velocity, self._kept_ns = 0, (np.zeros(3), 0.0), 0
+        self.turned, self.impulse = np.eye(3), np.zeros(3)
+        self._in_gap: dict[tuple[int, int], int] = {}
         self._was_lost = False
         self._slots: dict[int, int] = {}
         self._journal, self._estimates = DetectionJournal(), CausalEstimates()
@@ -283,8 +336,11 @@ class FilterShell(ABC):
     # ---------------------------------------------------------------- mathematics of a filter
 
     @abstractmethod
-    def predict(self, motion: Motion, duration_s: float) -> None:
-        """Carry the state over the motion to the next epoch."""
+    def advance(self, events: Events, k: int) -> int:
+        """Predict over epochs, continue the interval of gravity (`add_force`) and correct by depth, from event k on.
+
+        Stops at an event over a gap or of another kind, and returns its number; frames may be used and `Views` filled.
+        """
 
     @abstractmethod
     def correct_up(self, up: Floats, sigma: float) -> None:
@@ -293,10 +349,6 @@ class FilterShell(ABC):
     @abstractmethod
     def correct_plane(self, plane: PlanarMotion) -> None:
         """Update by the plane on which the vehicle stays."""
-
-    @abstractmethod
-    def correct_depth(self, motion: Motion, z_m: float, variance_m2: float) -> None:
-        """Update by the height of the pressure port a motion after the state."""
 
     @abstractmethod
     def observe(
@@ -324,9 +376,12 @@ class FilterShell(ABC):
     def attitude(self) -> Floats:
         """world_R_body of the state, shape (3, 3)."""
 
-    def gyro_bias(self) -> Floats | None:
-        """Estimated gyro bias, shape (3,), rad/s; None where the state has none."""
-        return None
+    has_bias = False
+    """True where the state has a gyro bias."""
+
+    def gyro_bias(self) -> Floats:
+        """Estimated gyro bias, shape (3,), rad/s; zero where the state has none."""
+        return NO_BIAS
 
     # ---------------------------------------------------------------- contract of an estimator
 
@@ -344,15 +399,14 @@ class FilterShell(ABC):
         """
         end_ns, detections = measurements.end_ns, measurements.detections
         self.odometry.add(measurements.imu, measurements.dvl)
-        check_rows(measurements)
         if self._reached_ns == NOT_STARTED:
             self._start(end_ns)
         since_ns, self._done_ns = max(self._done_ns, self._reached_ns), max(self._done_ns, end_ns)
-        ids, told, frames = self._sorted_out(detections, since_ns)
+        ids, views = self._views(detections, since_ns)
         estimate = None
         if end_ns >= max(self._reached_ns, self.node_ns):
             try:
-                estimate = self._use(measurements, since_ns, ids, told, frames)
+                estimate = self._use(measurements, since_ns, ids, views)
             except np.linalg.LinAlgError as error:
                 raise EstimatorError(
                     f"{self.name}: between {self.node_ns} and {end_ns} ns the expected covariance of a measurement is"
@@ -360,8 +414,7 @@ class FilterShell(ABC):
                 ) from error
             self._estimates.keep(estimate)
         if detections is not None:
-            for stamp_ns, landmark_id, row in zip(detections.stamps_ns.tolist(), ids, told, strict=True):
-                self._journal.record(stamp_ns, landmark_id, *row)
+            self._journal.extend(detections.stamps_ns, ids, views.outcome, views.e, views.S)
         return estimate
 
     def trajectory(self) -> Trajectory:
@@ -396,123 +449,121 @@ class FilterShell(ABC):
         waiting = range(start_ns, end_ns)
         self._reached_ns = start_ns + bisect_left(waiting, True, key=lambda t: self.odometry.start_by(t) is not None)
         self.node_ns = self._opened_ns = self._kept_ns = start_ns
-        self._opened_velocity, self._opened_R = self.odometry.velocity_at_imu(start_ns), self.attitude()
+        self._opened_velocity = self.odometry.velocity_at_imu(start_ns)
 
-    def _sorted_out(
-        self, detections: LandmarkDetections | None, since_ns: int
-    ) -> tuple[list[int], list[Told], dict[int, list[int]]]:
-        """Most probable identities and refusals of detections, and rows to be used by the stamps of their frames.
+    def _views(self, detections: LandmarkDetections | None, since_ns: int) -> tuple[Ints, Views]:
+        """Most probable identities of detections, and their views.
 
         Rows before the first epoch is reached, or older than those done, are refused.
         """
         if detections is None:
-            return [], [], {}
+            return NO_STAMPS, NO_VIEWS
+        n, stamps_ns = len(detections), detections.stamps_ns
         identities = identify(detections, self._minimum_id_probability)
-        told: list[Told] = []
-        frames: dict[int, list[int]] = {}
-        for row, stamp_ns in enumerate(detections.stamps_ns.tolist()):
-            reason = identities.refusals[row]
-            if stamp_ns < since_ns:
-                reason = Outcome.UNLOCATED if stamp_ns < self._reached_ns else Outcome.LATE
-            told.append((reason or Outcome.USED, None, None))
-            if reason is None:
-                frames.setdefault(stamp_ns, []).append(row)
-        return identities.ids.tolist(), told, frames
+        outcome = np.array([OPEN if why is None else OUTCOME_NUMBERS[why] for why in identities.refusals], np.int8)
+        if stamps_ns[0] < since_ns:
+            outcome[stamps_ns < since_ns] = OUTCOME_NUMBERS[Outcome.LATE]
+            outcome[stamps_ns < self._reached_ns] = OUTCOME_NUMBERS[Outcome.UNLOCATED]
+        landmark = np.array([-1 if self._was_lost else self._slots.get(i, -1) for i in identities.ids.tolist()])
+        z, e, S = np.empty((n, 2)), np.full((n, 2), math.nan), np.full((n, 2, 2), math.nan)
+        z[:, 0], z[:, 1] = detections.range_m, detections.azimuth_rad
+        return identities.ids, Views(stamps_ns, landmark, z, self.sonar.noise_of(detections), outcome, e, S)
 
-    def _use(
-        self, measurements: Measurements, since_ns: int, ids: list[int], told: list[Told], frames: dict[int, list[int]]
-    ) -> Estimate:
+    def _use(self, measurements: Measurements, since_ns: int, ids: Ints, views: Views) -> Estimate:
         """Carry the state to the newest epoch reached at the end of the call, with all measurements on the way."""
-        end_ns, depth, detections = measurements.end_ns, measurements.depth, measurements.detections
-        epochs_ns = self.odometry.epochs(self.node_ns, end_ns)
-        reached_ns = self.odometry.reached_ns(epochs_ns)
-        happening = list(zip(reached_ns.tolist(), [EPOCH] * len(epochs_ns), epochs_ns.tolist(), strict=True))
-        happening.append((end_ns, END, 0))
-        heights: list[tuple[float, float]] = []
-        if depth is not None:
-            heights = list(zip(depth.z_m.tolist(), depth.variance_m2.tolist(), strict=True))
-            happening += [(t, DEPTH, row) for row, t in enumerate(depth.stamps_ns.tolist()) if t >= since_ns]
-        z, R_z = NO_VIEWS
-        if detections is not None and frames:
-            z = np.array((detections.range_m, detections.azimuth_rad)).T.copy()
-            R_z = self.sonar.noise_of(detections)
-            happening += [(stamp_ns, FRAME, stamp_ns) for stamp_ns in frames]
-        events = in_order(happening, self.node_ns, self._opened_ns, self._interval_ns)
-        known_ns, _, _, starts_ns, ends_ns = map(np.array, zip(*events, strict=True))
-        motions = self.odometry.motions(starts_ns, ends_ns, known_ns, NO_BIAS)
-        has_gap = np.isnan(motions.dp[:, 0]).tolist()
-        has_rate = self._earth is not None or self.gyro_bias() is not None
-        for event, is_over_gap, motion in zip(events, has_gap, map(Motion, *motions), strict=True):
-            stamp_ns, kind, row, _, _ = event
-            if is_over_gap:
-                motion = self._over_gap(event, len(frames[row]) if kind == FRAME else int(kind == DEPTH))
-            elif has_rate:
-                motion = self._without_rate(event, motion)
-            if kind == EPOCH:
-                self.predict(motion, (row - self.node_ns) * 1e-9)
-                self.node_ns, self._in_gap = row, {DEPTH: 0, FRAME: 0}
-                if self._plane:
-                    self.correct_plane(self._plane)
-            elif kind == GRAVITY:
-                self._use_gravity(event, motion)
-            elif kind == DEPTH:
-                z_m, variance_m2 = heights[row]
-                self.correct_depth(motion, z_m, self._depth_variance if math.isnan(variance_m2) else variance_m2)
-            elif kind == FRAME:
-                for row in frames[stamp_ns]:
-                    told[row] = self._see(ids[row], motion, z[row], R_z[row])
-        R, X, covariance = self.pose_after(motion)
+        events = self._events(measurements, since_ns, views)
+        kinds, is_over_gap, k = events.kind.tolist(), np.isnan(events.motions.dp[:, 0]).tolist(), 0
+        while kinds[k] != END:
+            if kinds[k] == PLANE and self._plane is not None:
+                self.correct_plane(self._plane)
+            elif kinds[k] == GRAVITY:
+                self._use_gravity(int(events.end_ns[k]))
+            else:
+                if is_over_gap[k]:
+                    self._bridge(events, k)
+                used_until = self.advance(events, k)
+                if used_until > k:
+                    k = used_until
+                    continue
+                self._see(ids, self.motion_to(events, k), views, int(events.row[k]))
+            k += 1
+        if is_over_gap[k]:
+            self._bridge(events, k)
+        self.node_ns = int(events.start_ns[k])
+        R, X, covariance = self.pose_after(self.motion_to(events, k))
         self.odometry.settle(self.node_ns)
-        if (needed_ns := self._opened_ns if self._interval_ns else self.node_ns) > self._kept_ns + KEPT_NS:
-            self.odometry.forget_before(needed_ns)
-            self._kept_ns = needed_ns
-        return Estimate(end_ns, gtsam.Pose3(gtsam.Rot3(R), X), covariance)
+        if self.node_ns > self._kept_ns + KEPT_NS:
+            self.odometry.forget_before(self.node_ns)
+            self._kept_ns = self.node_ns
+        return Estimate(measurements.end_ns, gtsam.Pose3(gtsam.Rot3(R), X), covariance)
 
-    def _without_rate(self, event: Event, motion: Motion) -> Motion:
-        """The motion without the gyro bias of the state and the Earth's rate."""
-        bias, R_i = self.gyro_bias(), self._opened_R if event.kind == GRAVITY else self.attitude()
-        earth = NO_RATE if self._earth is None else R_i.T @ self._earth
-        dR, dp, C, D, impulse = motion
-        dR, dp, impulse = corrected(dR, dp, D, impulse, NO_BIAS if bias is None else bias, earth)
+    def _events(self, measurements: Measurements, since_ns: int, views: Views) -> Events:
+        """What happens up to the end of a call, from the state's epoch on."""
+        end_ns, depth = measurements.end_ns, measurements.depth
+        epochs_ns = self.odometry.epochs(self.node_ns, end_ns)
+        depth_ns, z_m, variance_m2 = NO_STAMPS, NO_DEPTH, NO_DEPTH
+        if depth is not None:
+            depth_ns, z_m = depth.stamps_ns, depth.z_m
+            variance_m2 = np.where(np.isnan(depth.variance_m2), self._depth_variance, depth.variance_m2)
+        columns = np.empty((5, 3 * len(epochs_ns) + len(depth_ns) + len(views.stamp_ns) + 1), np.int64)
+        n = in_order(
+            epochs_ns, self.odometry.reached_ns(epochs_ns), depth_ns, views, since_ns, end_ns, self.node_ns,
+            self._opened_ns, self._interval_ns, self._plane is not None, columns,
+        )  # fmt: skip
+        stamp_ns, start_ns, until_ns, kind, row = columns[:, :n]
+        motions = self.odometry.motions(start_ns, until_ns, stamp_ns, NO_BIAS)
+        has_rate = np.full(n, self._has_rate)
+        return Events(stamp_ns, start_ns, until_ns, kind, row, motions, has_rate, z_m, variance_m2, views)
+
+    def motion_to(self, events: Events, k: int) -> Motion:
+        """Motion to an event, without the gyro bias of the state and the Earth's rate."""
+        dR, dp, C, D, impulse = (column[k] for column in events.motions)
+        if events.has_rate[k]:
+            dR, dp, impulse = corrected(dR, dp, D, impulse, self.gyro_bias(), self.attitude().T @ self.earth)
         return Motion(dR, dp, C, D, impulse)
 
-    def _over_gap(self, event: Event, count: int) -> Motion:
-        """Motion over a gap of the Doppler log, with the share of its error that so many more measurements may have.
+    def _bridge(self, events: Events, k: int) -> None:
+        """Write the motion over a gap, with the share of its error that the measurements of one more event may have.
 
         A state without bias has no place for what an unknown one does in a gap, where it tilts gravity: it is added to
         the covariance of the displacement. Elsewhere its drift is left out, as published.
         """
-        bias, R_i = self.gyro_bias(), self._opened_R if event.kind == GRAVITY else self.attitude()
-        removed = NO_BIAS if bias is None else bias
-        over = self.odometry.motion(event.start_ns, event.end_ns, removed, R_i, event.stamp_ns)
+        stamp_ns, start_ns, end_ns, kind, row = (int(column[k]) for column in events[:5])
+        over = self.odometry.motion(start_ns, end_ns, self.gyro_bias(), self.attitude(), stamp_ns)
         C, D = over.covariance.copy(), over.D_bias
-        if bias is None:
+        if not self.has_bias:
             C[3:, 3:] += self.calibration.imu.gyro_bias_sigma**2 * D[3:] @ D[3:].T
-        if count:
-            self._in_gap[event.kind] += count
-            C *= self._in_gap[event.kind] * (self._in_gap[event.kind] + 1)
-        self._was_lost = True
-        dR = np.ascontiguousarray(over.i_T_j.rotation().matrix())
-        return Motion(dR, over.i_T_j.translation(), C, D, over.mean_specific_force * over.duration_s)
+        if kind in (DEPTH, FRAME):
+            more = 1 if kind == DEPTH else len(open_rows(events.views, row))
+            self._in_gap[start_ns, kind] = count = self._in_gap.get((start_ns, kind), 0) + more
+            C *= count * (count + 1)
+        self._was_lost, events.has_rate[k], events.views.landmark[:] = True, False, -1
+        pose, impulse = over.i_T_j, over.mean_specific_force * over.duration_s
+        for column, value in zip(
+            events.motions, (pose.rotation().matrix(), pose.translation(), C, D, impulse), strict=True
+        ):
+            column[k] = value
 
-    def _use_gravity(self, event: Event, motion: Motion) -> None:
-        """Update by the direction of gravity over an interval that ends at the state's epoch."""
-        duration_s, velocity_i, variance_i = (event.end_ns - event.start_ns) * 1e-9, *self._opened_velocity
-        velocity_j, variance_j = self.odometry.velocity_at_imu(event.end_ns)
-        up = up_direction(motion.impulse / duration_s, motion.dR, velocity_i, velocity_j, duration_s)
+    def _use_gravity(self, epoch_ns: int) -> None:
+        """Update by the direction of gravity over the interval that ends at an epoch."""
+        duration_s, (velocity_i, variance_i) = (epoch_ns - self._opened_ns) * 1e-9, self._opened_velocity
+        velocity_j, variance_j = self.odometry.velocity_at_imu(epoch_ns)
+        up = up_direction(self.impulse / duration_s, self.turned, velocity_i, velocity_j, duration_s)
         velocity_sigma = math.sqrt(0.5 * (variance_i + variance_j))
         sigma = tilt_sigma(duration_s, velocity_sigma, self.calibration.imu, self.calibration.gravity_m_s2)
         if math.isfinite(up[0]):
             self.correct_up(up, sigma)
-        self._opened_ns, self._opened_velocity = event.end_ns, (velocity_j, variance_j)
-        if self._earth is not None:
-            self._opened_R = self.attitude()
+        self._opened_ns, self._opened_velocity = epoch_ns, (velocity_j, variance_j)
+        self.turned, self.impulse = np.eye(3), np.zeros(3)
 
-    def _see(self, landmark_id: int, motion: Motion, z: Floats, R_z: Floats) -> Told:
-        """Update by a detection of a landmark, or append the landmark at first sight."""
-        if landmark_id not in self._slots:
-            self.augment(motion, z, R_z)
-            self._slots[landmark_id] = len(self._slots)
-            return Outcome.NEW, None, None
-        is_used, e, S = self.observe(motion, self._slots[landmark_id], z, R_z, may_be_far=self._was_lost)
-        return Outcome.USED if is_used else Outcome.GATED, e, S
+    def _see(self, ids: Ints, motion: Motion, views: Views, first: int) -> None:
+        """Update by the landmarks of a frame, or append them at first sight."""
+        for row in open_rows(views, first):
+            landmark_id, z, R_z = int(ids[row]), views.z[row], views.R_z[row]
+            if landmark_id not in self._slots:
+                self.augment(motion, z, R_z)
+                self._slots[landmark_id], views.outcome[row] = len(self._slots), NEW
+                continue
+            slot = self._slots[landmark_id]
+            is_used, views.e[row], views.S[row] = self.observe(motion, slot, z, R_z, may_be_far=self._was_lost)
+            views.outcome[row] = USED if is_used else GATED

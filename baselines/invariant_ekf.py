@@ -8,7 +8,18 @@ from typing import ClassVar
 import numpy as np
 
 from baselines import invariant_equations as equations
-from baselines.filter import FilterParams, FilterShell, Motion, far_view, is_inside, polar_covariance
+from baselines.filter import (
+    DEPTH,
+    EPOCH,
+    Events,
+    FilterParams,
+    FilterShell,
+    Motion,
+    add_force,
+    far_view,
+    is_inside,
+    polar_covariance,
+)  # fmt: skip
 from baselines.invariant_equations import BARE, BETA, BODY, EYE, THETA, UP, InvariantState
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
 from sonar_graph.measurements import Floats
@@ -64,6 +75,8 @@ class InvariantEkf(FilterShell):
         """world_R_body of the state, shape (3, 3)."""
         return self._state.R
 
+    has_bias = True
+
     def gyro_bias(self) -> Floats:
         """Estimated gyro bias, shape (3,), rad/s."""
         return self._state.bias
@@ -71,6 +84,18 @@ class InvariantEkf(FilterShell):
     def predict(self, motion: Motion, duration_s: float) -> None:
         """Carry the state over the motion to the next epoch, (2) and (3)."""
         equations.predict(self._state, motion, self._walk_density**2 * duration_s)
+
+    def advance(self, events: Events, k: int) -> int:
+        """Predict over epochs and correct by depth, from event k on."""
+        while events.kind[k] in (EPOCH, DEPTH) and not np.isnan(events.motions.dp[k, 0]):
+            motion, row = self.motion_to(events, k), events.row[k]
+            if events.kind[k] == EPOCH:
+                self.predict(motion, (events.end_ns[k] - events.start_ns[k]) * 1e-9)
+                add_force(self.turned, self.impulse, motion.dR, motion.impulse)
+            else:
+                self.correct_depth(motion, events.z_m[row], events.variance_m2[row])
+            k += 1
+        return k
 
     def correct_up(self, up: Floats, sigma: float) -> None:
         """Update by the world's up in the body, shape (3,), with the sigma of its tilt, rad, (8)."""

@@ -285,7 +285,7 @@ class LandmarkDetections(Block):
 
     def most_probable(self) -> tuple[Ints, Floats]:
         """Identity with the highest posterior, and that posterior, shapes (n,) and (n,)."""
-        best = np.argmax(self.id_probability, axis=1)
+        best = self.id_probability.argmax(axis=1)
         row = np.arange(len(self))
         return self.candidate_ids[row, best], self.id_probability[row, best]
 
@@ -297,7 +297,7 @@ class Measurements:
     Raises
     ------
     MeasurementError
-        When ``end_ns`` is no integer.
+        When ``end_ns`` is no integer, or a detection or depth sample is stamped after it.
 
     Examples
     --------
@@ -318,3 +318,9 @@ class Measurements:
                 f"Measurements.end_ns: expected an integer, nanoseconds, not {self.end_ns!r}; of seconds:"
                 " round(seconds * 1e9)"
             )
+        for rows in (self.depth, self.detections):
+            if rows is not None and rows.stamps_ns[-1] > self.end_ns:
+                raise MeasurementError(
+                    f"Measurements: {type(rows).__name__} has a row at {rows.stamps_ns[-1]} ns, after end_ns ="
+                    f" {self.end_ns}; hand it in with the call that reaches it"
+                )

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.errors import MeasurementError
@@ -290,6 +291,14 @@ class DetectionJournal:
         self._innovations.extend(UNKNOWN[:2] if innovation is None else innovation.tolist())
         self._innovation_covs.extend(UNKNOWN if innovation_cov is None else innovation_cov.ravel().tolist())
         return self._forgotten + len(self) - 1
+
+    def extend(self, stamps_ns: Ints, ids: Ints, outcomes: NDArray[np.int8], innovations: Floats, covs: Floats) -> None:
+        """Append rows, with outcomes as `OUTCOME_NUMBERS`; NaN without a prediction."""
+        self._stamps_ns.frombytes(stamps_ns.tobytes())
+        self._ids.frombytes(ids.tobytes())
+        self._outcomes.frombytes(outcomes.tobytes())
+        self._innovations.frombytes(innovations.tobytes())
+        self._innovation_covs.frombytes(covs.tobytes())
 
     def log(self) -> DetectionLog:
         """Rows that are not forgotten."""

@@ -10,11 +10,12 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from baselines.ekf_slam import EkfSlam
-from baselines.filter import FilterShell, Motion
+from baselines.filter import DEPTH, END, EPOCH, NO_VIEWS, Events, FilterShell, Motion
 from baselines.invariant_ekf import InvariantEkf
 from baselines.invariant_equations import InvariantState
 from sonar_graph.calibration import Calibration, DepthCalibration, Mounting, SonarCalibration
-from sonar_graph.measurements import Floats
+from sonar_graph.measurements import NS_PER_S, Floats
+from sonar_graph.motion import Motions
 from sonar_graph.navigation import Odometry
 
 SONAR = Mounting(translation_m=(0.4, 0.1, -0.2), rpy_rad=(0.1, 0.5, -0.2))
@@ -82,6 +83,21 @@ def sonar_after(world: World, motion: Motion, eps: Floats = NOTHING) -> gtsam.Po
 def carried(world: World, motion: Motion, eps: Floats = NOTHING) -> World:
     pose = pose_after(world, motion, eps)
     return world._replace(R=pose.rotation().matrix(), X=pose.translation())
+
+
+def one_event(kind: int, motion: Motion, duration_s: float, z_m: float = 0.0, variance_m2: float = 0.0) -> Events:
+    """An event at the end of a motion without bias and Earth's rate, and the end of the call."""
+    stamps = np.array([[0, 0], [0, 0], [round(duration_s * NS_PER_S)] * 2, [kind, END], [0, 0]], np.int64)
+    motions = Motions(*(np.array([part, part]) for part in motion))
+    return Events(*stamps, motions, np.zeros(2, bool), np.array([z_m]), np.array([variance_m2]), NO_VIEWS)
+
+
+def predict(slam: FilterShell, motion: Motion, duration_s: float = 1.0) -> None:
+    assert slam.advance(one_event(EPOCH, motion, duration_s), 0) == 1
+
+
+def correct_depth(slam: FilterShell, motion: Motion, z_m: float, variance_m2: float) -> None:
+    assert slam.advance(one_event(DEPTH, motion, 1.0, z_m, variance_m2), 0) == 1
 
 
 def random_covariance(n: int, scale: float = 0.03, seed: int = 0) -> Floats:

@@ -27,8 +27,10 @@ from .filters import (
     begun,
     both,
     carried,
+    correct_depth,
     motion_of,
     pose_after,
+    predict,
     random_covariance,
     rotation,
     sonar_after,
@@ -72,7 +74,7 @@ def test_prediction_has_the_numerical_covariance_of_state_and_motion(filter_, an
     expected, slam = carried(world, motion), begun(filter_, world)
     F, J = numerical(lambda true, eps: filter_.error(carried(true, motion, eps), expected), filter_, world)
     _, P = filter_.estimate(slam)
-    slam.predict(motion, 0.0)
+    predict(slam, motion, 0.0)
     after, covariance = filter_.estimate(slam)
     assert_allclose(filter_.error(after, expected), 0.0, atol=1e-12)
     assert_covariance(covariance, F @ P @ F.T + J @ C @ J.T)
@@ -123,7 +125,7 @@ def test_updates_by_a_detection_and_by_depth_are_the_textbook_s(filter_, angles,
     slam = begun(filter_, world)
     height = lambda true, eps: pose_after(true, motion, eps).transformFrom(PORT)[2:]  # noqa: E731
     H, H_m = numerical(height, filter_, world)
-    slam.correct_depth(motion, height(world, NOTHING)[0] + 0.02, 3e-4)
+    correct_depth(slam, motion, height(world, NOTHING)[0] + 0.02, 3e-4)
     assert_corrected(filter_, slam, world, P, H, H_m @ C @ H_m.T + 3e-4, np.array([0.02]))
 
 
@@ -163,7 +165,7 @@ def test_depth_up_and_plane_are_scalar_kalman_updates_where_nothing_correlates(f
         return gtsam.Rot3(R).rpy(), X, np.diag(cov)
 
     noisy = still._replace(C=0.02 * np.eye(6))
-    _, X, variances = after(lambda slam: slam.correct_depth(noisy, 0.01, 0.03))
+    _, X, variances = after(lambda slam: correct_depth(slam, noisy, 0.01, 0.03))
     assert variances[5] == pytest.approx(1 / (1 / z + 1 / 0.05))
     assert X[2] == pytest.approx(0.01 * z / (z + 0.05))
     # the body's y axis points up by a milliradian: roll
@@ -248,7 +250,7 @@ def test_the_bias_walks_where_there_is_one():
     slam, motion, duration_s = begun(Invariant, world_at(ANGLES)), motion_of(np.zeros(6), np.zeros((6, 6))), 4.0
     before = slam.state()[1].P
     density = CALIBRATION.imu.gyro_bias_walk_density
-    slam.predict(motion._replace(D=np.zeros((6, 3))), duration_s)
+    predict(slam, motion._replace(D=np.zeros((6, 3))), duration_s)
     walked = np.diag([0.0] * 3 + [density**2 * duration_s] * 3 + [0.0] * 9)
     assert_allclose(slam.state()[1].P - before, walked, atol=1e-3 * walked.max())
 
@@ -291,7 +293,7 @@ def test_no_measurement_tells_where_the_world_is_or_which_way_it_is_turned(angle
     assert_allclose(H @ gauge(2), 0.0, atol=1e-10)
     assert np.linalg.norm(H @ gauge(3)[:, 2]) > 1.0
     slam = begun(Invariant, world, known)
-    slam.predict(motion, 0.0)
+    predict(slam, motion, 0.0)
     assert_allclose(slam.state()[1].P, known, atol=1e-12)
 
 

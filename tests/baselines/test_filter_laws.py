@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from baselines.dead_reckoning import DeadReckoning
 from baselines.ekf_slam import EkfSlam
-from baselines.filter import DEPTH, END, EPOCH, FRAME, GRAVITY, Motion, corrected, in_order
+from baselines.filter import DEPTH, END, EPOCH, FRAME, GRAVITY, OPEN, PLANE, USED, Motion, Views, corrected, in_order
 from baselines.invariant_ekf import InvariantEkf
 from sonar_graph.calibration import (
     Calibration,
@@ -266,7 +266,7 @@ def test_a_row_of_motion_that_was_used_comes_too_late_and_changes_nothing(kind):
 def test_a_row_after_the_instant_is_an_error_that_names_it(rows):
     (block,) = rows.values()
     with pytest.raises(MeasurementError, match=f"{type(block).__name__} has a row at {T0_NS + 1} ns, after end_ns"):
-        begun(EkfSlam, Calibration()).process(Measurements(T0_NS, **rows))
+        Measurements(T0_NS, **rows)
 
 
 @slam_filters
@@ -344,17 +344,24 @@ def test_a_bias_and_the_earth_s_rate_are_removed_from_a_motion_as_from_its_rows(
 
 
 def test_events_come_in_the_order_of_their_stamps_each_with_its_motion_from_the_newest_epoch():
-    """At equal stamps epoch, gravity, depth, frame; gravity from the epoch where it was last used, once it is over."""
-    happening = [(60, END, 0), (20, FRAME, 20), (45, FRAME, 45), (20, DEPTH, 0), (50, DEPTH, 1), (10, DEPTH, 2)]
-    happening += [(20, EPOCH, 19), (40, EPOCH, 39), (58, EPOCH, 57)]
+    """At equal stamps epoch, plane, gravity, depth, frame; gravity where its interval is long enough."""
+    depth, seen = np.array([3, 10, 20, 50]), np.array([18, 20, 20, 45, 45])
+    views = Views(seen, seen, *[np.empty(0)] * 2, np.array([OPEN, OPEN, OPEN, USED, OPEN], np.int8), *[np.empty(0)] * 2)
+
+    def events(interval_ns, is_planar=False):
+        epochs, reached, out = np.array([19, 39, 57]), np.array([20, 40, 58]), np.empty((5, 30), np.int64)
+        n = in_order(epochs, reached, depth, views, 10, 60, 5, 5, interval_ns, is_planar, out)
+        return list(map(tuple, out[:, :n].T.tolist()))
+
     expected = [
-        (10, DEPTH, 2, 5, 10), (20, EPOCH, 19, 5, 19), (20, DEPTH, 0, 19, 20), (20, FRAME, 20, 19, 20),
-        (40, EPOCH, 39, 19, 39), (40, GRAVITY, 39, 5, 39), (45, FRAME, 45, 39, 45), (50, DEPTH, 1, 39, 50),
-        (58, EPOCH, 57, 39, 57), (60, END, 0, 57, 60),
+        (10, 5, 10, DEPTH, 1), (18, 5, 18, FRAME, 0), (20, 5, 19, EPOCH, 0), (20, 19, 20, DEPTH, 2),
+        (20, 19, 20, FRAME, 1), (40, 19, 39, EPOCH, 1), (40, 39, 39, GRAVITY, 0), (45, 39, 45, FRAME, 4),
+        (50, 39, 50, DEPTH, 3), (58, 39, 57, EPOCH, 2), (60, 57, 60, END, 0),
     ]  # fmt: skip
-    assert in_order(happening, 5, 5, 34) == expected
-    assert in_order(happening, 5, 5, 0) == [event for event in expected if event[1] != GRAVITY]
-    assert [event[1] for event in in_order(happening, 5, 5, 14)].count(GRAVITY) == 3
+    assert events(34) == expected
+    assert events(0) == [event for event in expected if event[3] != GRAVITY]
+    assert [event[3] for event in events(14, is_planar=True)[3:6]] == [PLANE, GRAVITY, DEPTH]
+    assert [event[3] for event in events(14)].count(GRAVITY) == 3
 
 
 @pytest.mark.slow

@@ -33,17 +33,19 @@ def identify(detections: LandmarkDetections, minimum_probability: float) -> Iden
         Rows whose highest posterior is below it, or is not a number, or belongs to no identity (-1), are refused.
     """
     ids, probability = detections.most_probable()
-    refusals = [
-        None if p >= minimum_probability and landmark_id >= 0 else Outcome.NO_IDENTITY
-        for p, landmark_id in zip(probability.tolist(), ids.tolist(), strict=True)
-    ]
-    places = list(zip(detections.stamps_ns.tolist(), ids.tolist(), strict=True))
-    best: dict[tuple[int, int], int] = {}
-    for row, place in enumerate(places):
-        if refusals[row] is None and (place not in best or probability[row] > probability[best[place]]):
-            best[place] = row
-    once = [why if why or best[places[row]] == row else Outcome.REPEATED for row, why in enumerate(refusals)]
-    return Identities(ids, once)
+    rows = zip(detections.stamps_ns.tolist(), ids.tolist(), probability.tolist(), strict=True)
+    refusals: list[Outcome | None] = []
+    best: dict[tuple[int, int], tuple[int, float]] = {}
+    for row, (stamp_ns, landmark_id, p) in enumerate(rows):
+        is_likely = p >= minimum_probability and landmark_id >= 0
+        refusals.append(None if is_likely else Outcome.NO_IDENTITY)
+        if is_likely:
+            other, other_p = best.get((stamp_ns, landmark_id), (row, -1.0))
+            if p > other_p:
+                best[stamp_ns, landmark_id] = row, p
+            if other != row:
+                refusals[other if p > other_p else row] = Outcome.REPEATED
+    return Identities(ids, refusals)
 
 
 @cache
