@@ -8,6 +8,7 @@ doubtful_identities.md, unknown_landmarks.md), and may change its mind; the land
 
 from collections.abc import Set
 from dataclasses import replace
+from itertools import compress
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from sonar_graph.slam.landmarks import (
     MixtureIdentities,
     MixtureIdentity,
     NamelessLandmarks,
+    Screened,
     SeenFrame,
     SightingFactors,
     TrackedIdentities,
@@ -31,6 +33,8 @@ from sonar_graph.slam.models import KernelParams
 from sonar_graph.slam.smoother import Changed
 from sonar_graph.states import DetectionLog, Outcome
 
+NOTHING = Screened([], [])
+
 
 class Frontend:
     """Adds the factors of detected landmarks to a smoother and records what became of each detection."""
@@ -38,7 +42,7 @@ class Frontend:
     def __init__(self, identity: IdentityParams, kernel: KernelParams, keyframes: Keyframes) -> None:
         self.journal = AmendableJournal()
         self._keyframes = keyframes
-        factors = SightingFactors(keyframes.calibration.sonar, kernel.robust)
+        factors = SightingFactors(keyframes.calibration.sonar, kernel.robust())
         self.landmarks = LandmarkGraph(keyframes.smoother, factors, self.journal)
         self._uses_tracks = identity.longest_wait_s > 0
         self.policy: IdentityPolicy
@@ -55,7 +59,6 @@ class Frontend:
         seen = self._screened(frame)
         if seen is None:
             return
-        self.update_if_due()
         for assignments in self.policy.assign(seen):
             self.landmarks.apply(assignments, self._keyframes.newest_s)
             self.update_if_due()
@@ -75,26 +78,27 @@ class Frontend:
         if not self._uses_tracks:
             frame = replace(frame, track=np.full(len(frame), NO_TRACK))
         stamp_ns, is_sound = int(frame.stamps_ns[0]), sound_detections(frame)
-        refusals: list[Outcome | None] = [None if sound else Outcome.UNSOUND for sound in is_sound.tolist()]
-        kept = np.flatnonzero(is_sound).tolist()
+        refusals: list[Outcome | None] = [Outcome.UNSOUND] * len(frame)
+        waits, kept = [False] * len(frame), np.flatnonzero(is_sound).tolist()
         if self._keyframes.newest_ns is None:
-            late: list[Outcome | None] = [Outcome.UNLOCATED] * len(kept)
+            said = Screened([Outcome.UNLOCATED] * len(kept), [False] * len(kept))
         elif stamp_ns < self._keyframes.advanced_ns:
-            late = [Outcome.LATE] * len(kept)
+            said = Screened([Outcome.LATE] * len(kept), [False] * len(kept))
         else:
-            late = self.policy.screen(frame if is_sound.all() else frame.rows(is_sound)) if kept else []
-        for row, why in zip(kept, late, strict=True):
-            refusals[row] = why
+            said = self.policy.screen(frame if len(kept) == len(frame) else frame.rows(is_sound)) if kept else NOTHING
+        for row, why, wait in zip(kept, *said, strict=True):
+            refusals[row], waits[row] = why, wait
+        is_open = [why is None or wait for why, wait in zip(refusals, waits, strict=True)]
         ids = frame.most_probable()[0].tolist()
         rows = [
-            self.journal.record(stamp_ns, landmark_id, why or Outcome.WAITING)
-            for landmark_id, why in zip(ids, refusals, strict=True)
+            self.journal.record(stamp_ns, i, Outcome.WAITING if is_seen or why is None else why)
+            for i, why, is_seen in zip(ids, refusals, is_open, strict=True)
         ]
-        open_ = [row for row, why in enumerate(refusals) if why is None]
-        if not open_:
+        if not any(is_open):
             return None
-        seen = frame if len(open_) == len(frame) else frame.rows(np.array(open_))
-        return SeenFrame(seen, [rows[row] for row in open_], self._keyframes, self.landmarks.factors)
+        seen = frame if all(is_open) else frame.rows(np.array(is_open))
+        rows, ids, refusals = (list(compress(column, is_open)) for column in (rows, ids, refusals))
+        return SeenFrame(seen, rows, ids, refusals, self._keyframes, self.landmarks.factors)
 
     def smoothed(self) -> Solution:
         """Solution of the whole graph, with the doubtful identities that fit it best."""

@@ -8,7 +8,6 @@ One call of `Isam2.process`::
     newest keyframe's estimate, carried on by odometry ──► Estimate at end_ns
 """
 
-import math
 from bisect import bisect_left
 from collections.abc import Iterable
 from typing import Any, ClassVar, Literal, Self, get_args
@@ -112,7 +111,6 @@ class Isam2:
         self._smoother = Smoother(p.smoother, self._asked if p.history.policy == "bounded" else None)
         self._keyframes = Keyframes(calibration, odometry, p.keyframes, self._smoother)
         self._sightings = Frontend(p.identity, p.kernel, self._keyframes)
-        self._forgot_s = -math.inf
 
     @property
     def graph(self) -> gtsam.NonlinearFactorGraph:
@@ -150,7 +148,6 @@ class Isam2:
                 self._sightings.advance(int(frame.stamps_ns[0]))
                 self._sightings.add(frame)
         self._sightings.advance(measurements.end_ns)
-        self._sightings.update_if_due()
         if self._keyframes.newest_ns is None:
             return None
         self._forget()
@@ -162,10 +159,10 @@ class Isam2:
 
     def _forget(self) -> None:
         """Drop old poses and outcomes of a bounded history, in batches."""
-        history, now_s = self._params.history, self._keyframes.newest_s
-        remembered_s = history.remembered_s if history.policy == "bounded" else None
-        if remembered_s is not None and now_s - self._forgot_s > remembered_s / 4:
-            self._forgot_s, oldest_ns = now_s, round((now_s - remembered_s) * NS_PER_S)
+        history, now_ns = self._params.history, self._keyframes.stamps_ns[-1]
+        if history.policy == "bounded" and history.remembered_s is not None:
+            batch_ns = round(history.remembered_s * NS_PER_S / 4)
+            oldest_ns = (now_ns // batch_ns - 4) * batch_ns  # by the newest keyframe, however the log is cut
             self._asked.forget_before(oldest_ns)
             self._sightings.journal.forget_before(oldest_ns)
 

@@ -25,7 +25,7 @@ from sonar_graph.navigation.alignment import gravity_direction
 from sonar_graph.numerics import compiled
 from sonar_graph.slam.models import factors
 from sonar_graph.slam.smoother import Changed, Smoother
-from sonar_graph.states import DetectionJournal, Outcome, Refusal, RefusedRow
+from sonar_graph.states import Refusal, RefusedRow
 
 ROUNDING = 1e-13
 """Share of the largest variance below which what is left of another is taken for zero."""
@@ -36,16 +36,6 @@ def sound_detections(frame: LandmarkDetections) -> Flags:
     """Rows that a sonar can have measured, shape (n,)."""
     unsaid = np.asarray(np.isnan(frame.range_azimuth_cov).any(axis=(1, 2)))
     return possible_ranges(frame.range_m) & (unsaid | positive_definite(frame.range_azimuth_cov))
-
-
-def without_unsound(frame: LandmarkDetections, journal: DetectionJournal) -> LandmarkDetections | None:
-    """Frame without rows that no sonar can have measured, which go to the journal; None: no row is left."""
-    is_sound = sound_detections(frame)
-    if is_sound.all():
-        return frame
-    for landmark_id in frame.most_probable()[0][~is_sound].tolist():
-        journal.record(int(frame.stamps_ns[0]), landmark_id, Outcome.UNSOUND)
-    return frame.rows(is_sound) if is_sound.any() else None
 
 
 @compiled
@@ -109,7 +99,7 @@ class Keyframes:
         self._estimates_bias = self.calibration.imu.gyro_bias_sigma > 0
         self._bias_since_ns = 0
         self._latest: tuple[int, PreintegratedMotion] | None = None
-        self._linearised: tuple[Floats, Floats] | None = None
+        self._linearised: tuple[Floats, Floats] = np.zeros(3), np.eye(3)
         self._depths: list[Depth] = []
         self._told = 0
         self._refused: list[RefusedRow] = []
@@ -177,11 +167,12 @@ class Keyframes:
                 self.smoother.add({"bias prior": factors.bias_prior(B(0), self.calibration.imu.gyro_bias_sigma)})
             self._constrain(0)
             changes.append(self.smoother.update(self.newest_s))
+            self._linearise()
         interval_ns = round(self.params.max_interval_s / S_PER_NS)
-        for node_ns in self.odometry.epochs(self.stamps_ns[-1], until_ns).tolist():
-            if node_ns - self.stamps_ns[-1] >= interval_ns:
-                self._set(node_ns)
-                changes.append(self.smoother.update(self.newest_s))
+        while len(due_ns := self.odometry.epochs(self.stamps_ns[-1] + interval_ns - 1, until_ns)):
+            self._set(int(due_ns[0]))
+            changes.append(self.smoother.update(self.newest_s))
+            self._linearise()
         return changes
 
     def set_for_frame(self, stamp_ns: int, motion: PreintegratedMotion) -> PreintegratedMotion:
@@ -190,10 +181,11 @@ class Keyframes:
         node_ns = int(epochs_ns[-1]) if len(epochs_ns) else None
         if node_ns is not None:
             sonar, bias_sigma = self.calibration.sonar, self.calibration.imu.gyro_bias_sigma
-            variances = np.diag(motion.covariance) + bias_sigma**2 * (motion.D_bias**2).sum(axis=1)
+            variances = (motion.covariance.diagonal() + bias_sigma**2 * (motion.D_bias**2).sum(axis=1)).tolist()
             share = max(variances[:3]) / sonar.azimuth_sigma_rad**2, max(variances[3:]) / sonar.range_sigma_m**2
             if max(share) > self.params.motion_noise_share:
                 self._set(node_ns)
+                self._linearise()
                 motion = self.motion_since_newest(stamp_ns)
         if not self.odometry.is_gap(node_ns or self.stamps_ns[-1], stamp_ns):
             self._told = 0
@@ -206,10 +198,15 @@ class Keyframes:
     def motion_since_newest(self, until_ns: int) -> PreintegratedMotion:
         """Provisional motion from the newest keyframe to an instant not before that of any earlier call."""
         if self._latest is None or self._latest[0] != until_ns:
-            if self._linearised is None:  # iterations in between do not touch motions until the next keyframe
-                self._linearised = self.bias(len(self.stamps_ns) - 1), self._attitude()
             self._latest = until_ns, self.odometry.motion(self.stamps_ns[-1], until_ns, *self._linearised)
         return self._latest[1]
+
+    def _linearise(self) -> None:
+        """Fix bias and attitude for the motions from a new keyframe, at its estimate when it is set.
+
+        At the first question they would depend on who asks.
+        """
+        self._linearised, self._latest = (self.bias(len(self.stamps_ns) - 1), self._attitude()), None
 
     def update_if_due(self) -> Changed | None:
         """Bring the smoother up to date when what was added since it last was matters."""
@@ -241,7 +238,6 @@ class Keyframes:
         self._add_depth(j, start_ns, node_ns, bias)
         self.bias_keys.append(self._next_bias_key(i, node_ns))
         self.stamps_ns.append(node_ns)
-        self._linearised = self._latest = None
         self._constrain(j)
         self.odometry.forget_before(node_ns)
 
@@ -261,31 +257,34 @@ class Keyframes:
         """
         if not self._depths:
             return
-        waiting = Depth.concatenate(self._depths)
-        later = waiting.between(node_ns, LATEST_NS)
-        self._depths = [later] if later else []
+        columns = zip(*((block.stamps_ns, block.z_m, block.variance_m2) for block in self._depths), strict=True)
+        stamps_ns, z_m, variance_m2 = map(np.concatenate, columns)
+        later = [block for block in self._depths if block.stamps_ns[-1] > node_ns]
+        self._depths = [rest for block in later if (rest := block.between(node_ns, LATEST_NS))]
         epochs_ns = [start_ns, *self.odometry.epochs(start_ns, node_ns).tolist()]
         found_ns = [b for a, b in pairwise(epochs_ns) if self.odometry.is_gap(a, b)]
-        samples = waiting.between(found_ns[-1] - CARRIED_IN_GAP_NS if found_ns else start_ns, node_ns)
-        if samples is None:
-            return
-        until_ns = np.append(samples.stamps_ns[1:], node_ns)
-        known_ns = np.full(len(samples), self.odometry.reached_ns(np.array([node_ns]))[0])
-        motions = self.odometry.motions(samples.stamps_ns, until_ns, known_ns, bias)
+        after_ns = found_ns[-1] - CARRIED_IN_GAP_NS if found_ns else start_ns
+        first, end = stamps_ns.searchsorted([after_ns, node_ns], side="right").tolist()
+        known_ns = np.full(end - first, self.odometry.reached_ns(np.array([node_ns]))[0])
+        until_ns = np.append(stamps_ns[first + 1 : end], node_ns)[: end - first]
+        motions = self.odometry.motions(stamps_ns[first:end], until_ns, known_ns, bias)
         lost = np.flatnonzero(np.isnan(motions.dp[:, 0]))  # a gap shorter than what samples are carried over
-        first, n = int(lost[-1]) + 1 if len(lost) else 0, len(samples)
-        if first == n:
+        kept = int(lost[-1]) + 1 if len(lost) else 0
+        if kept == end - first:
             return
-        k_R_j, k_p_j = np.tile(np.eye(3), (n + 1, 1, 1)), np.zeros((n + 1, 3))
-        for k in reversed(range(first, n)):
-            k_R_j[k], k_p_j[k] = motions.dR[k] @ k_R_j[k + 1], motions.dp[k] + motions.dR[k] @ k_p_j[k + 1]
-        ups = k_R_j[first + 1 :] @ self.smoother.values.atPose3(X(j)).rotation().matrix()[2]
-        wander_m2 = np.einsum("ka,kab,kb->k", ups, motions.C[first:, 3:, 3:], ups)
-        variance = np.where(np.isnan(samples.variance_m2), self.calibration.depth.sigma_m**2, samples.variance_m2)
-        weights, mean_variance = weights_at_end(variance[first:], wander_m2)
-        ports = np.einsum("kba,kb->ka", k_R_j[first:n], np.array(self.calibration.depth.port_m) - k_p_j[first:n])
-        z_m = float(weights @ samples.z_m[first:])
-        self.smoother.add({"depth": factors.depth(X(j), z_m, weights @ ports, mean_variance**0.5)})
+        backwards_R, backwards_p = [np.eye(3)], [np.zeros(3)]
+        for dR, dp in zip(motions.dR[kept:][::-1], motions.dp[kept:][::-1], strict=True):
+            backwards_R.append(dR.dot(backwards_R[-1]))
+            backwards_p.append(dp + dR.dot(backwards_p[-1]))
+        k_R_j, k_p_j = np.array(backwards_R[::-1]), np.array(backwards_p[::-1])
+        ups = k_R_j[1:] @ self.smoother.values.atPose3(X(j)).rotation().matrix()[2]
+        wander_m2 = np.einsum("ka,kab,kb->k", ups, motions.C[kept:, 3:, 3:], ups)
+        used = slice(first + kept, end)
+        variance_m2 = np.where(np.isnan(variance_m2[used]), self.calibration.depth.sigma_m**2, variance_m2[used])
+        weights, mean_variance = weights_at_end(variance_m2, wander_m2)
+        ports = np.einsum("kba,kb->ka", k_R_j[:-1], np.array(self.calibration.depth.port_m) - k_p_j[:-1])
+        height_m = float(weights @ z_m[used])
+        self.smoother.add({"depth": factors.depth(X(j), height_m, weights @ ports, mean_variance**0.5)})
 
     def _constrain(self, j: int) -> None:
         if self.calibration.planar:

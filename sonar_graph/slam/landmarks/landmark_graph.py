@@ -27,7 +27,7 @@ from gtsam.symbol_shorthand import L
 
 from sonar_graph.measurements import Floats, LandmarkDetections
 from sonar_graph.slam.estimates import Solution
-from sonar_graph.slam.landmarks.sighting import SeenFrame, Sighting, SightingFactors
+from sonar_graph.slam.landmarks.sighting import Screened, SeenFrame, Sighting, SightingFactors
 from sonar_graph.slam.smoother import Changed, FactorGroup, Smoother
 from sonar_graph.states import OUTCOME_NUMBERS, UNKNOWN, DetectionJournal, Outcome
 
@@ -72,8 +72,8 @@ class Assignment(NamedTuple):
 class IdentityPolicy(Protocol):
     """Decides of which landmarks sightings are."""
 
-    def screen(self, frame: LandmarkDetections) -> list[Outcome | None]:
-        """Refusals of rows by what is said of them alone; None: the row is looked at."""
+    def screen(self, frame: LandmarkDetections) -> Screened:
+        """Judge rows by what is said of them alone."""
 
     def assign(self, frame: SeenFrame) -> Iterator[list[Assignment]]:
         """Rounds of assignments, of a frame's sightings and of earlier ones.

@@ -33,7 +33,7 @@ from sonar_graph.slam.landmarks.mixture import (
     each_once,
     supporters_elsewhere,
 )
-from sonar_graph.slam.landmarks.sighting import SeenFrame, Sighting, late_view
+from sonar_graph.slam.landmarks.sighting import Screened, SeenFrame, Sighting, late_view
 from sonar_graph.slam.landmarks.tracked import NS_PER_S, GatedIdentity, RobustIdentity, second_rows_of_tracks
 from sonar_graph.slam.models import Kernel
 from sonar_graph.slam.smoother import marginals_of, solve_in_sight
@@ -86,9 +86,9 @@ class MixtureIdentities:
         self.watches: list[TrackedObject] = []
         """All tracked objects in the order in which they began."""
 
-    def screen(self, frame: LandmarkDetections) -> list[Outcome | None]:
+    def screen(self, frame: LandmarkDetections) -> Screened:
         """Refuse second rows of tracks."""
-        return second_rows_of_tracks(frame, {})
+        return Screened(second_rows_of_tracks(frame, {}), [False] * len(frame))
 
     def assign(self, frame: SeenFrame) -> Iterator[list[Assignment]]:
         """The frame's sightings, with what waited in their tracks; then others as the estimate moves.
@@ -301,7 +301,7 @@ class MixtureIdentities:
         for landmark_id, sightings in of.items():
             for k, sighting in enumerate(sorted(sightings, key=lambda sighting: (sighting.stamp_ns, sighting.row))):
                 for factor in self._landmarks.factors.make(sighting, L(landmark_id), is_first=k == 0).values():
-                    graph.push_back(factor)
+                    graph.add(factor)
         return graph
 
 

@@ -6,6 +6,7 @@ what is said of a landmark once is said by its earliest sighting (docs/theory/id
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -68,6 +69,8 @@ class SightingFactors:
         self.elevation_sigma_rad = sonar.elevation_aperture_rad / math.sqrt(12.0)
         """Standard deviation of an elevation that is uniform over the aperture."""
         self._aperture_rad = sonar.elevation_aperture_rad
+        self.body_T_sonar = sonar.mounting.pose()
+        """Sonar on the body."""
         self._robust = robust
 
     def make(self, sighting: Sighting, key: int, *, is_first: bool) -> Factors:
@@ -98,6 +101,15 @@ class SightingFactors:
         return elevation_on_floor(world_T_sonar, float(z[0]), float(z[1]), floor.z_m, self._aperture_rad) or 0.0
 
 
+class Screened(NamedTuple):
+    """Rows of a frame by what is said of them alone."""
+
+    refusals: list[Outcome | None]
+    """Reason why a row has no identity; None: it has one, or the policy chooses it by place."""
+    waits: list[bool]
+    """True: a row without an identity is looked at all the same."""
+
+
 class SeenFrame:
     """Detections of one frame, seen from the newest keyframe, or from a new one that it needs.
 
@@ -105,23 +117,32 @@ class SeenFrame:
     ----------
     rows
         Rows of the detections in the journal.
+    ids, refusals
+        Most probable identity of each detection, and the reason why it does not count (`Screened`).
     z, noise
         Range (m) and azimuth (rad), shape (m, 2), and the sonar's covariance of them, shape (m, 2, 2).
     """
 
     def __init__(
-        self, detections: LandmarkDetections, rows: list[int], keyframes: Keyframes, factors: SightingFactors
+        self,
+        detections: LandmarkDetections,
+        rows: list[int],
+        ids: list[int],
+        refusals: list[Outcome | None],
+        keyframes: Keyframes,
+        factors: SightingFactors,
     ) -> None:
         self.detections, self.rows, self.keyframes = detections, rows, keyframes
+        self.ids, self.refusals = ids, refusals
         self.stamp_ns = int(detections.stamps_ns[0])
-        self.z = np.column_stack((detections.range_m, detections.azimuth_rad))
+        self.z = np.array((detections.range_m, detections.azimuth_rad)).T.copy()
         self.noise = detections.range_azimuth_cov
         is_unknown = np.isnan(self.noise).any(axis=(1, 2))
         sonar = keyframes.calibration.sonar
         if is_unknown.any():
             self.noise = self.noise.copy()
             self.noise[is_unknown] = np.diag([sonar.range_sigma_m**2, sonar.azimuth_sigma_rad**2])
-        self._factors, self._body_T_sonar = factors, sonar.mounting.pose()
+        self._factors, self._body_T_sonar = factors, factors.body_T_sonar
         self._tie: tuple[int, PreintegratedMotion] | None = None
 
     def predict(self, keys: list[int]) -> PredictedView:

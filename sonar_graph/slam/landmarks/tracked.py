@@ -19,7 +19,7 @@ from sonar_graph.measurements import NO_TRACK, LandmarkDetections
 from sonar_graph.slam.estimates import Solution
 from sonar_graph.slam.landmarks.association import gate_threshold, identify
 from sonar_graph.slam.landmarks.landmark_graph import Assignment, LandmarkGraph
-from sonar_graph.slam.landmarks.sighting import SeenFrame, Sighting, beam_point, late_view
+from sonar_graph.slam.landmarks.sighting import Screened, SeenFrame, Sighting, beam_point, late_view
 from sonar_graph.slam.landmarks.unknown import IgnoredUnknown, NamelessLandmarks, UnknownParams, unnamed
 from sonar_graph.states import Outcome
 
@@ -144,24 +144,28 @@ class TrackedIdentities:
         self._longest_wait_ns = round(params.longest_wait_s * NS_PER_S)
         self._tracks: dict[int, Track] = {}
 
-    def screen(self, frame: LandmarkDetections) -> list[Outcome | None]:
+    def screen(self, frame: LandmarkDetections) -> Screened:
         """Refuse second rows of tracks, and rows of no track whose identity is not probable enough or taken."""
+        oldest_ns = int(frame.stamps_ns[0]) - self._longest_wait_ns
+        known = {number: track.identity for number, track in self._tracks.items() if track.newest_ns >= oldest_ns}
+        refusals, waits = second_rows_of_tracks(frame, known), frame.track != NO_TRACK
         if self._nameless is not None:
             self._nameless.refuse_taken_ids(frame)
-        refusals = second_rows_of_tracks(frame, {number: track.identity for number, track in self._tracks.items()})
+            waits |= unnamed(frame)
         kept = [row for row, why in enumerate(refusals) if why is None]
-        may_wait = (frame.track != NO_TRACK) | (unnamed(frame) & (self._nameless is not None))
-        once = frame if len(kept) == len(frame) else frame.rows(np.array(kept))
-        said = identify(once, self._minimum_probability)
-        for row, why in zip(kept, said.refusals, strict=True):
-            refusals[row] = None if may_wait[row] else why
-        return refusals
+        if len(kept) == len(frame):
+            return Screened(identify(frame, self._minimum_probability).refusals, waits.tolist())
+        for row, why in zip(
+            kept, identify(frame.rows(np.array(kept)), self._minimum_probability).refusals, strict=True
+        ):
+            refusals[row] = why
+        return Screened(refusals, [wait and row in kept for row, wait in enumerate(waits.tolist())])
 
     def assign(self, frame: SeenFrame) -> Iterator[list[Assignment]]:
         """Earlier sightings of tracks whose identity changes, then the frame's, those without a name last."""
         seen = frame.detections
-        is_nameless = unnamed(seen) & (self._nameless is not None)
-        rows, tracks = np.flatnonzero(~is_nameless).tolist(), seen.track.tolist()
+        nameless = np.flatnonzero(unnamed(seen)).tolist() if self._nameless is not None else []
+        rows, tracks = [row for row in range(len(seen)) if row not in nameless], seen.track.tolist()
         tracked = [row for row in rows if tracks[row] != NO_TRACK]
         if tracked:
             yield from self._hear(seen.rows(np.array(tracked)))
@@ -172,7 +176,7 @@ class TrackedIdentities:
             yield assigned
         if self._nameless is not None:
             taken = {s.landmark_id for s in sightings.values() if s.landmark_id is not None}
-            yield from self._nameless.assign(frame, np.flatnonzero(is_nameless).tolist(), taken)
+            yield from self._nameless.assign(frame, nameless, taken)
         for row in tracked:
             sighting, track = sightings[frame.rows[row]], self._tracks[tracks[row]]
             (track.waiting if sighting.outcome is Outcome.WAITING else track.settled).append(sighting)
@@ -274,9 +278,8 @@ class TrackedIdentities:
     def _judge(self, frame: SeenFrame, rows: list[int]) -> list[Assignment]:
         """Use what has an identity, inside the gate if its landmark is in the graph; the rest waits in its track."""
         values, make = self._landmarks.smoother.values, self._landmarks.factors
-        said, is_tracked = identify(frame.detections, self._minimum_probability), frame.detections.track != NO_TRACK
-        ids: list[int] = said.ids.tolist()
-        named = [row for row in rows if said.refusals[row] is None]
+        ids, refusals, is_tracked = frame.ids, frame.refusals, frame.detections.track != NO_TRACK
+        named = [row for row in rows if refusals[row] is None]
         known = [row for row in named if ids[row] in self._landmarks]
         keys = [L(ids[row]) for row in known]
         view, judged = frame.predict(keys), []
@@ -296,8 +299,8 @@ class TrackedIdentities:
                 (sighting,) = frame.sightings(view, [row], None if is_tracked[row] else start[None])
                 sighting.floor, sighting.elevation_rad = floor, 0.0 if is_tracked[row] else elevation
                 judged.append(Assignment(sighting, Outcome.NEW, ids[row], start=start))
-        kept = [row for row in rows if said.refusals[row] is not None]
+        kept = [row for row in rows if refusals[row] is not None]
         for row, sighting in zip(kept, frame.sightings(view, kept), strict=True):
-            is_taken = said.refusals[row] is Outcome.REPEATED  # a more probable row of the frame has the landmark
+            is_taken = refusals[row] is Outcome.REPEATED  # a more probable row of the frame has the landmark
             judged.append(Assignment(sighting, Outcome.REPEATED if is_taken else Outcome.WAITING))
         return judged

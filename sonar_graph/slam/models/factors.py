@@ -18,6 +18,7 @@ coordinate is e near the axis. So a horizontal and a vertical sigma state what i
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Annotated, Literal
 
 import gtsam
@@ -58,10 +59,10 @@ class Kernel(Section):
         """The loss as GTSAM has it; None for Gaussian noise."""
         return None
 
-    def robust(self, noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
-        """A noise model with this loss."""
+    def robust(self) -> Robust:
+        """Function that gives a noise model this loss."""
         estimator = self.estimator()
-        return noise if estimator is None else gtsam.noiseModel.Robust.Create(estimator, noise)
+        return (lambda noise: noise) if estimator is None else partial(gtsam.noiseModel.Robust.Create, estimator)
 
     @property
     def log_normaliser(self) -> float:

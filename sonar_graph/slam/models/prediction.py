@@ -75,10 +75,12 @@ class PredictedView:
         self._pose_row = covariance.rows[pose_key]
         self._by_body = body_T_sonar.inverse().AdjointMap()
         """Derivative of the sonar's pose by the body's, both at the frame, shape (6, 6)."""
-        self._by_state = [(self._pose_row, keyframe_T_sonar.inverse().AdjointMap())]
-        """Rows of keyframe and bias, and the derivatives of the sonar's pose by them, shapes (6, 6) and (6, 3)."""
+        self._by_state = np.zeros((6, len(covariance.matrix)))
+        """Derivative of the sonar's pose by all variables of the covariance, of which keyframe and bias count."""
+        self._by_state[:, self._pose_row : self._pose_row + 6] = keyframe_T_sonar.inverse().AdjointMap()
         if bias_key is not None:
-            self._by_state.append((covariance.rows[bias_key], self._by_body @ motion.D_bias))
+            row = covariance.rows[bias_key]
+            self._by_state[:, row : row + 3] = self._by_body @ motion.D_bias
 
     def height_variance(self, point: Floats) -> float:
         """Variance of the world z of a point fixed to the body at the frame, shape (3,) in the world, m².
@@ -99,8 +101,7 @@ class PredictedView:
         Range (m) and azimuth (rad), shape (m, 2), and their covariances, shape (m, 2, 2).
         """
         predicted, joint = self.expect_jointly(keys, points, [])
-        k = np.arange(len(keys))
-        return predicted, joint.reshape(len(keys), 2, len(keys), 2)[k, :, k]
+        return predicted, np.einsum("kikj->kij", joint.reshape(len(keys), 2, len(keys), 2))
 
     def expect_jointly(self, keys: list[int], points: Floats, sources: list[Source]) -> tuple[Floats, Floats]:
         """Joint expectation of landmarks of the graph, shape (m, 3), and of points that are not in it.
@@ -109,12 +110,10 @@ class PredictedView:
         -------
         Range (m) and azimuth (rad), shape (m + s, 2), and their joint covariance, shape (2 (m + s), 2 (m + s)).
         """
-        everywhere = np.concatenate([points.reshape(-1, 3), *(source.point[None] for source in sources)])
+        everywhere = np.array([*points, *(source.point for source in sources)]).reshape(-1, 3) if sources else points
         predicted, by_sonar, by_point = project_all(everywhere, self.world_T_sonar.matrix())
         rows, P, n = self.covariance.rows, self.covariance.matrix, len(everywhere)
-        H = np.zeros((n, 2, len(P)))
-        for row, by_state in self._by_state:
-            H[:, :, row : row + by_state.shape[1]] = by_sonar @ by_state
+        H = by_sonar @ self._by_state
         for k, key in enumerate(keys):
             H[k, :, rows[key] : rows[key] + 3] = by_point[k]
         for k, source in enumerate(sources, start=len(keys)):
@@ -144,8 +143,8 @@ def weigh(z: Floats, expected: Floats, prior_cov: Floats, cov: Floats) -> Compar
     innovation[:, 1] -= 2.0 * np.pi * np.ceil((innovation[:, 1] - np.pi) / (2.0 * np.pi))
     (r, alpha), (a, b, _, c) = innovation.T, S.reshape(-1, 4).T
     distance = (c * r**2 - 2.0 * b * r * alpha + a * alpha**2) / (a * c - b**2)
-    expected_variances, noise_variances = np.diagonal(prior_cov, 0, 1, 2), np.diagonal(cov, 0, 1, 2)
-    return ComparedRow(innovation, S, distance, (expected_variances / noise_variances).max(axis=1))
+    gain = np.maximum(prior_cov[:, 0, 0] / cov[:, 0, 0], prior_cov[:, 1, 1] / cov[:, 1, 1])
+    return ComparedRow(innovation, S, distance, gain)
 
 
 def _height_derivative(world_T_body: gtsam.Pose3, point: Floats) -> Floats:

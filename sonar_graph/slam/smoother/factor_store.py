@@ -102,5 +102,5 @@ def graph_of(groups: Iterable[FactorGroup]) -> gtsam.NonlinearFactorGraph:
     graph = gtsam.NonlinearFactorGraph()
     for group in groups:
         for factor in group:
-            graph.push_back(factor)
+            graph.add(factor)
     return graph

@@ -19,7 +19,7 @@ def split(
     inside, outside = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
     for i in range(graph.size()):
         factor = graph.at(i)
-        (inside if kept.issuperset(factor.keys()) else outside).push_back(factor)
+        (inside if kept.issuperset(factor.keys()) else outside).add(factor)
     return inside, outside
 
 
@@ -46,9 +46,9 @@ def with_marginals(
     graph = gtsam.NonlinearFactorGraph()
     for factor in (window.at(i) for i in range(window.size()) if window.exists(i)):
         if isinstance(factor, gtsam.LinearContainerFactor):
-            graph.push_back(gtsam.LinearContainerFactor(factor.linearize(theta), theta))
+            graph.add(gtsam.LinearContainerFactor(factor.linearize(theta), theta))
         elif factor not in left_out:
-            graph.push_back(factor)
+            graph.add(factor)
     return graph
 
 
@@ -97,7 +97,7 @@ class SmootherWindow:
         try:
             graph = gtsam.NonlinearFactorGraph(inside)
             for factor in marginal(*outside, times_s, is_by_qr=self.is_by_qr) if outside else ():
-                graph.push_back(factor)
+                graph.add(factor)
             self.isam = self._empty()
             self.isam.update(graph, values, times_s)
         except RuntimeError:
@@ -137,4 +137,4 @@ class SmootherWindow:
     def largest_shift(self, keys: Sequence[int]) -> float:
         """Largest component by which one of some variables has moved from where it was linearised, rad or m."""
         delta = self.isam.getDelta()
-        return max((float(np.abs(delta.at(key)).max()) for key in keys), default=0.0)
+        return float(np.abs([delta.at(key) for key in keys]).max(initial=0.0))
