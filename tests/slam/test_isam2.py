@@ -110,15 +110,6 @@ def test_nothing_peeks_ahead(basin, cut_s):
     assert all(same(a, b) for a, b in zip(whole, cut[:-1], strict=False))
 
 
-def test_motion_and_depth_that_arrive_early_are_not_used_early():
-    """All rows but the detections at once: the estimates are those of rows that come in time."""
-    sequence = small_world()
-    early = Isam2(sequence.calibration, Odometry(sequence.calibration))
-    for k, (step, expected) in enumerate(zip(sequence.replay(sequence.instants(2.0)), ran(sequence)[1], strict=True)):
-        blocks = (None, None, None) if k else (sequence.imu, sequence.dvl, sequence.depth)
-        assert same(expected, early.process(Measurements(step.end_ns, *blocks, step.detections)))
-
-
 def test_refused_detections_leave_everything_as_it_is():
     sequence = small_world()
     rows = sequence.detections
