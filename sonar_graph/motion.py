@@ -6,7 +6,8 @@ the derivative by the gyro bias. Its perturbation is [rotation, translation] in 
     i_R_j = dR Exp(theta),    i_p_j = dp + dR rho,    [theta; rho] = D (bias - bias_0) + n,    n ~ N(0, C)
 
 Epochs are the stamps of the Doppler log: between two of them the velocity is known on both sides and the motion is
-final. An epoch counts as reached once an IMU row at or after it has come. docs/theory/preintegration.md.
+final. An epoch counts as reached once its velocity is known and an IMU row at or after it has come; a velocity that has
+to wait for others to confirm or complete it is known from their stamp on. docs/theory/preintegration.md.
 """
 
 from __future__ import annotations
@@ -125,7 +126,7 @@ class MotionSource(Protocol):
         ...
 
     def reached_ns(self, epochs_ns: Ints) -> Ints:
-        """Instants at which epochs are reached: stamps of the first IMU rows at or after them, shape (n,)."""
+        """Instants at which epochs are reached: an IMU row covers them, and their velocities are known; shape (n,)."""
         ...
 
     def is_gap(self, start_ns: int, end_ns: int) -> bool:

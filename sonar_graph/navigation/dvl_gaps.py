@@ -32,7 +32,7 @@ from sonar_graph.motion import PreintegratedMotion
 from sonar_graph.navigation.inertial import Line, hat, spread, sums_along
 from sonar_graph.navigation.samples import LATEST_NS, WINDOW_NS, longest_interval_ns
 from sonar_graph.navigation.steps import Rows
-from sonar_graph.navigation.sums import motions_over
+from sonar_graph.navigation.sums import START, motions_over
 
 FEWEST, SHORTEST_S = 4, 1.0
 """Fewest samples of a line, and the shortest time that they span."""
@@ -66,17 +66,33 @@ class Sensors(NamedTuple):
         )
 
 
+class Stretch(NamedTuple):
+    """Sums of the steps from one instant to another, to be continued."""
+
+    start_ns: int
+    until_ns: int
+    sums: Floats = START
+    """As in `sonar_graph.navigation.sums`."""
+
+
 def motion_over(
-    rows: Rows, sensors: Sensors, start_ns: int, end_ns: int, known_ns: int, bias: Floats, earth: Floats = ZERO
+    rows: Rows, sensors: Sensors, start_ns: int, end_ns: int, bias: Floats, earth: Floats = ZERO
 ) -> PreintegratedMotion:
-    """Motion by linear or held velocities, however far apart the samples are."""
-    start, end, known = (np.array([t]) for t in (start_ns, end_ns, known_ns))
-    noise = sensors.body_p_dvl, sensors.gyro_density
-    found = motions_over(rows, start, end, known, LATEST_NS, bias, earth, *noise)
-    dR, dp, C, D, impulse = (column[0] for column in found)
-    duration_s = (end_ns - start_ns) * 1e-9
+    """Motion by linear or held velocities of all rows, however far apart the samples are."""
+    return continued(Stretch(start_ns, start_ns), rows, sensors, end_ns, bias, earth)[1]
+
+
+def continued(
+    so_far: Stretch, rows: Rows, sensors: Sensors, end_ns: int, bias: Floats, earth: Floats
+) -> tuple[Stretch, PreintegratedMotion]:
+    """Sums continued to an instant, and the motion from their start; the Earth's rotation in the frame there."""
+    from_, until, known, sums = *np.array([[so_far.until_ns], [end_ns], [LATEST_NS]]), so_far.sums.copy()
+    noise = bias, earth, sensors.body_p_dvl, sensors.gyro_density
+    dR, dp, C, D, impulse = (c[0] for c in motions_over(rows, from_, until, known, LATEST_NS, *noise, sums))
+    duration_s = (end_ns - so_far.start_ns) * 1e-9
     mean_force = impulse / duration_s if duration_s > 0 else np.full(3, np.nan)
-    return PreintegratedMotion(gtsam.Pose3(gtsam.Rot3(dR), dp), C, D, bias, duration_s, mean_force)
+    motion = PreintegratedMotion(gtsam.Pose3(gtsam.Rot3(dR), dp), C, D, bias, duration_s, mean_force)
+    return Stretch(so_far.start_ns, end_ns, sums), motion
 
 
 def bridge(
@@ -84,16 +100,16 @@ def bridge(
 ) -> PreintegratedMotion:
     """Motion over a gap from an epoch to the next one (closed), or to an instant before it (open).
 
-    Rows are those stamped no later than the end, of a closed gap until an inertial row covers it. Removed are the gyro
-    bias (body axes) and the Earth's rotation (frame i), rad/s.
+    Used are rows known at the end, of a closed gap until an inertial row covers it. Removed are the gyro bias (body
+    axes) and the Earth's rotation (frame i), rad/s.
     """
+    rows = rows if is_closed else rows.known(end_ns)
     dvl_ns, T = rows.dvl_ns, (end_ns - start_ns) * 1e-9
     k = int(np.searchsorted(dvl_ns, start_ns))
-    later_ns = dvl_ns[k + 1 : k + 2]
-    if not is_closed and ((later_ns <= end_ns) & (later_ns - start_ns <= sensors.longest_ns)).any():
+    if not is_closed and (dvl_ns[k + 1 : k + 2] - start_ns <= sensors.longest_ns).any():
         # Velocities go on, inertial rows are missing: by velocities as far as they go.
-        last_ns = int(dvl_ns[np.searchsorted(dvl_ns, end_ns, side="right") - 1])
-        sampled = motion_over(rows, sensors, start_ns, last_ns, end_ns, bias, earth)
+        last_ns = int(dvl_ns[-1])
+        sampled = motion_over(rows, sensors, start_ns, last_ns, bias, earth)
         if last_ns == end_ns:
             return sampled
         return sampled.then(_walk(rows, sensors, last_ns, end_ns, bias, sampled.i_T_j.rotation().unrotate(earth)))
@@ -143,11 +159,11 @@ def _inertial(
     cuts_ns, jumps = rows.dvl_ns[samples], np.zeros((len(samples) + 1, 3))
     is_closed = cuts_ns[-1] == end_ns
     start_ns, imu_ns = int(cuts_ns[0 if is_closed else -1]), rows.imu_ns
-    imu_rows = int(np.searchsorted(imu_ns, end_ns)) + 1 if is_closed else int(np.searchsorted(imu_ns, end_ns, "right"))
+    imu_rows = int(np.searchsorted(imu_ns, end_ns)) + 1 if is_closed else len(imu_ns)
     arm, turn = sensors.body_p_dvl - sensors.body_p_imu, np.eye(3)
     # The turn since the first sample, from which the Earth's rate, known at the epoch, is removed.
     for _ in range(0 if is_closed else 1 + 2 * bool(earth.any())):
-        window = motion_over(rows, sensors, int(cuts_ns[0]), start_ns, end_ns, bias, turn @ earth)
+        window = motion_over(rows, sensors, int(cuts_ns[0]), start_ns, bias, turn @ earth)
         turn = window.i_T_j.rotation().matrix()
     rate = np.column_stack([np.interp(cuts_ns, imu_ns[:imu_rows], column[:imu_rows]) for column in rows.rate.T])
     jumps[:-1] = weights_s[:, None] * (rows.velocity[samples] - np.cross(rate - bias, arm))
@@ -191,16 +207,12 @@ def _walk(
     walked = (sensors.velocity_walk_density * T) ** 2 * np.eye(3)
     if doppler_psd is None:
         dvl_ns, velocity = np.array([start_ns - NS_PER_S, start_ns]), rows.velocity[[k, k]]
-        cov, known_ns = T * rows.cov[k] + walked / 3.0, end_ns
+        cov = T * rows.cov[k] + walked / 3.0
     else:
-        dvl_ns, velocity, cov = (
-            np.array([start_ns, end_ns]),
-            rows.velocity[k : k + 2],
-            (doppler_psd + walked / 12.0) / T,
-        )
-        known_ns = int(rows.imu_ns[np.searchsorted(rows.imu_ns, end_ns)])
-    log = rows._replace(dvl_ns=dvl_ns, velocity=velocity, cov=np.array([cov, cov]))
-    return motion_over(log, sensors, start_ns, end_ns, known_ns, bias, earth)
+        dvl_ns, velocity = np.array([start_ns, end_ns]), rows.velocity[k : k + 2]
+        cov = (doppler_psd + walked / 12.0) / T
+    log = rows._replace(dvl_ns=dvl_ns, velocity=velocity, cov=np.array([cov, cov]), known_ns=dvl_ns)
+    return motion_over(log, sensors, start_ns, end_ns, bias, earth)
 
 
 def remaining_motion(before: PreintegratedMotion, whole: PreintegratedMotion) -> PreintegratedMotion:

@@ -362,6 +362,7 @@ class JointPreintegrator:
             samples.stamps_ns,
             velocity,
             cov,
+            samples.stamps_ns,
             False,
             UNTURNED,
         )

@@ -1,12 +1,12 @@
 """Motion by gyros and Doppler log between any two instants.
 
 Epochs. The stamps of the DVL rows are *epochs*: between two epochs the velocity is known on both sides and the motion
-is final. An epoch counts as reached at time t when its own row and an IMU row at or after it are stamped at or before
-t. What happens between epochs (a detection, a depth sample, an estimate) is related to the newest reached epoch by a
-provisional motion that uses nothing stamped later. Results therefore depend on stamps alone, not on how a log is cut
-into blocks. Two exceptions, where rows are added long before they are used: the first velocities, and those after a
-long gap, are epochs once later ones have confirmed them, and rows of too few beams once a whole one has completed them
-(`sonar_graph.navigation.dvl_screening`).
+is final. A row is known from its own stamp on, one that waits (the first velocities, those after a long gap, those of
+too few beams) from that of the row that confirms or completes it (`sonar_graph.navigation.dvl_screening`). An epoch
+counts as reached at time t when its row is known and an IMU row at or after it is stamped at or before t. What happens
+between epochs (a detection, a depth sample, an estimate) is related to the newest reached epoch by a provisional motion
+that uses nothing known later. Results therefore depend on stamps alone, to the bit, not on how a log is cut into calls
+or what was asked in between, as long as no row comes after another of its sensor that is stamped later.
 
 Gaps. A gap between two epochs is bridged with both its ends known. In a gap that lasts, both instants are reached from
 the epoch at which bottom lock was lost::
@@ -26,7 +26,7 @@ from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints
 from sonar_graph.motion import Motions, PreintegratedMotion
 from sonar_graph.navigation.alignment import earth_rate_in_world
-from sonar_graph.navigation.dvl_gaps import Sensors, bridge, motion_over, remaining_motion
+from sonar_graph.navigation.dvl_gaps import Sensors, Stretch, bridge, continued, motion_over, remaining_motion
 from sonar_graph.navigation.dvl_screening import RowIntake
 from sonar_graph.navigation.imu_gaps import UNTURNED, turns_of
 from sonar_graph.navigation.samples import WINDOW_NS, finite_vector, no_doppler_stamp
@@ -75,7 +75,8 @@ class Odometry:
         self._sensors = Sensors.of(calibration)
         self._earth = earth_rate_in_world(calibration)
         self._dvl_p_imu = (self._sensors.body_p_imu - self._sensors.body_p_dvl).tolist()
-        self._final: tuple[tuple[int, bytes, bytes], int, PreintegratedMotion] | None = None
+        self._kept: tuple[tuple[int, bytes, bytes], PreintegratedMotion | None, Stretch] | None = None
+        """Start, bias and Earth's rate of a motion; its part until the last gap's end; the sums since."""
 
     @property
     def refused(self) -> list[RefusedRow]:
@@ -103,7 +104,7 @@ class Odometry:
         placed_imu = imu is not None and self._intake.add_imu(imu)
         placed_dvl = dvl is not None and self._intake.add_dvl(dvl)
         if placed_imu or placed_dvl:
-            self._final = None
+            self._kept = None
         return placed_imu or placed_dvl
 
     def settle(self, epoch_ns: int) -> None:
@@ -123,8 +124,7 @@ class Odometry:
         first = dvl_ns[np.searchsorted(dvl_ns, imu_ns[0]) :] if len(imu_ns) else dvl_ns[:0]
         if not len(first) or first[0] > imu_ns[-1]:
             return None
-        reached_ns = max(int(self.reached_ns(first[:1])[0]), self._intake.start_known_ns)
-        return int(first[0]) if reached_ns <= until_ns else None
+        return int(first[0]) if self.reached_ns(first[:1])[0] <= until_ns else None
 
     def epochs(self, after_ns: int, until_ns: int) -> Ints:
         """Epochs after one instant that are reached at another, in order, shape (n,)."""
@@ -132,11 +132,15 @@ class Odometry:
         seen = imu_ns.searchsorted(until_ns, side="right")
         if not seen:
             return dvl_ns[:0]
-        return dvl_ns[dvl_ns.searchsorted(after_ns, side="right") : dvl_ns.searchsorted(imu_ns[seen - 1], side="right")]
+        known = self._dvl.values[2].searchsorted(until_ns, side="right")
+        last = min(known, dvl_ns.searchsorted(imu_ns[seen - 1], side="right"))
+        return dvl_ns[dvl_ns.searchsorted(after_ns, side="right") : last]
 
     def reached_ns(self, epochs_ns: Ints) -> Ints:
-        """Instants at which epochs are reached: stamps of the first IMU rows at or after them, shape (n,)."""
-        return self._imu.stamps_ns[self._imu.stamps_ns.searchsorted(epochs_ns)]
+        """Instants at which epochs are reached: an IMU row covers them, and their velocities are known; shape (n,)."""
+        imu_ns, known_ns = self._imu.stamps_ns, self._dvl.values[2]
+        covered_ns = imu_ns[imu_ns.searchsorted(epochs_ns)]
+        return np.maximum(covered_ns, known_ns[self._dvl.stamps_ns.searchsorted(epochs_ns)])
 
     def is_gap(self, start_ns: int, end_ns: int) -> bool:
         """True for a time without Doppler rows that is too long for a linear velocity."""
@@ -145,7 +149,7 @@ class Odometry:
     def motion(
         self, start_ns: int, end_ns: int, bias: Floats, world_R_i: Floats | None = None, known_ns: int | None = None
     ) -> PreintegratedMotion:
-        """Motion from one instant to another, over gaps too, from rows stamped no later than an instant.
+        """Motion from one instant to another, over gaps too, from rows known at an instant, the first at any.
 
         The part up to the newest epoch is final and kept: the same start and bias, asked for later and later instants,
         cost what is new.
@@ -163,30 +167,19 @@ class Odometry:
             raise MeasurementError(f"interval: ends at {end_ns} ns, before its start {start_ns}; the earlier first")
         if start_ns < (first_ns := max(imu_ns[0], dvl_ns[0])):
             raise MeasurementError(f"start_ns: {start_ns} lies before the rows; begin at {first_ns} or later")
-        earth = ZERO if self._earth is None or world_R_i is None else world_R_i.T @ self._earth
         if known_ns is None:
             known_ns = end_ns
             if end_ns <= imu_ns[-1] and self._is_doppler_stamp(end_ns):
                 known_ns = int(self.reached_ns(np.array([end_ns]))[0])
-        if self._is_doppler_stamp(start_ns):
-            return self._since_epoch(start_ns, end_ns, known_ns, bias, earth)
-        rows, noise = self._rows(), (bias, earth)
-        epochs_ns = self.epochs(start_ns, min(end_ns, known_ns))
-        if len(epochs_ns):
-            first_ns = int(epochs_ns[0])
-            head = motion_over(rows, self._sensors, start_ns, first_ns, known_ns, *noise)
-            if first_ns == end_ns:
-                return head
-            earth = head.i_T_j.rotation().unrotate(earth)
-            return head.then(self._since_epoch(first_ns, end_ns, known_ns, bias, earth))
-        before_ns = self.epochs(dvl_ns[0] - 1, end_ns)
-        if start_ns < end_ns and len(before_ns) and self.is_gap(int(before_ns[-1]), end_ns):
+        noise = bias, ZERO if self._earth is None or world_R_i is None else world_R_i.T @ self._earth
+        before_ns = self.epochs(dvl_ns[0] - 1, min(end_ns, known_ns))
+        if len(before_ns) and before_ns[-1] < start_ns < end_ns and self.is_gap(int(before_ns[-1]), end_ns):
             lost_ns = int(before_ns[-1])
-            return remaining_motion(*(self._since_epoch(lost_ns, t, known_ns, *noise) for t in (start_ns, end_ns)))
-        return motion_over(rows, self._sensors, start_ns, end_ns, known_ns, *noise)
+            return remaining_motion(*(self._since(lost_ns, t, known_ns, *noise) for t in (start_ns, end_ns)))
+        return self._since(start_ns, end_ns, known_ns, *noise)
 
     def motions(self, start_ns: Ints, end_ns: Ints, known_ns: Ints, bias: Floats) -> Motions:
-        """Motions over intervals, each from rows stamped no later than its ``known_ns``."""
+        """Motions over intervals, each from rows known at its ``known_ns``."""
         sensors = self._sensors
         noise = bias, ZERO, sensors.body_p_dvl, sensors.gyro_density
         return motions_over(self._rows(), start_ns, end_ns, known_ns, sensors.longest_ns, *noise)
@@ -196,7 +189,7 @@ class Odometry:
         if not self._is_doppler_stamp(epoch_ns):
             raise no_doppler_stamp("epoch_ns", epoch_ns, self._dvl.stamps_ns)
         k, i = (int(stamps.searchsorted(epoch_ns)) for stamps in (self._dvl.stamps_ns, self._imu.stamps_ns))
-        (velocity, cov), (rates, _), imu_ns = self._dvl.values, self._imu.values, self._imu.stamps_ns
+        (velocity, cov, _), (rates, _), imu_ns = self._dvl.values, self._imu.values, self._imu.stamps_ns
         rate = rates[min(i, len(rates) - 1)]
         if 0 < i < len(rates) and not self._hold_past:
             rate = rates[i - 1] + (epoch_ns - imu_ns[i - 1]) / (imu_ns[i] - imu_ns[i - 1]) * (rates[i] - rates[i - 1])
@@ -205,51 +198,55 @@ class Odometry:
         return velocity[k] + swing, float(cov[k, 0, 0] + cov[k, 1, 1] + cov[k, 2, 2]) / 3.0
 
     def _rows(self) -> Rows:
-        imu, dvl = self._imu, self._dvl
-        return Rows(imu.stamps_ns, *imu.values, dvl.stamps_ns, *dvl.values, self._hold_past, self._turns)
+        (rate, force), (velocity, cov, known_ns) = self._imu.values, self._dvl.values
+        imu_ns, dvl_ns = self._imu.stamps_ns, self._dvl.stamps_ns
+        return Rows(imu_ns, rate, force, dvl_ns, velocity, cov, known_ns, self._hold_past, self._turns)
 
     def _is_doppler_stamp(self, instant_ns: int) -> bool:
         k = self._dvl.stamps_ns.searchsorted(instant_ns)
         return bool(k < len(self._dvl.stamps_ns) and self._dvl.stamps_ns[k] == instant_ns)
 
-    def _since_epoch(
-        self, start_ns: int, end_ns: int, known_ns: int, bias: Floats, earth: Floats
-    ) -> PreintegratedMotion:
-        """Motion from an epoch: final to the newest one, provisional from there on."""
-        key, rows, at_ns, motion = (start_ns, bias.tobytes(), earth.tobytes()), self._rows(), start_ns, None
-        epochs_ns = self.epochs(start_ns, known_ns)
-        epochs_ns = epochs_ns[: epochs_ns.searchsorted(end_ns, side="right")]
-        if len(epochs_ns):
-            newest_ns = int(epochs_ns[-1])
-            if self._final is not None and self._final[0] == key and self._final[1] <= newest_ns:
-                _, at_ns, motion = self._final
-            if at_ns < newest_ns:
-                marks_ns = np.concatenate([[at_ns], epochs_ns[epochs_ns.searchsorted(at_ns, side="right") :]])
-                for k in np.flatnonzero(marks_ns[1:] - marks_ns[:-1] > self._sensors.longest_ns).tolist():
-                    lost_ns, found_ns = int(marks_ns[k]), int(marks_ns[k + 1])
-                    if at_ns < lost_ns:
-                        motion = self._extended(motion, rows, at_ns, lost_ns, bias, earth)
-                    over_gap = bridge(rows, self._sensors, lost_ns, found_ns, True, bias, _in_frame(motion, earth))
-                    motion, at_ns = over_gap if motion is None else motion.then(over_gap), found_ns
-                if at_ns < newest_ns:
-                    motion, at_ns = self._extended(motion, rows, at_ns, newest_ns, bias, earth), newest_ns
-            assert motion is not None
-            self._final = key, at_ns, motion
-        if motion is not None and at_ns == end_ns:
-            return motion
-        if self.is_gap(at_ns, end_ns):
-            rest = bridge(rows, self._sensors, at_ns, end_ns, False, bias, _in_frame(motion, earth))
-        else:
-            rest = motion_over(rows, self._sensors, at_ns, end_ns, known_ns, bias, _in_frame(motion, earth))
-        return rest if motion is None else motion.then(rest)
+    def _since(self, start_ns: int, end_ns: int, known_ns: int, bias: Floats, earth: Floats) -> PreintegratedMotion:
+        """Motion from an instant: final to the newest epoch, provisional from there on.
 
-    def _extended(
-        self, motion: PreintegratedMotion | None, rows: Rows, at_ns: int, end_ns: int, bias: Floats, earth: Floats
-    ) -> PreintegratedMotion:
-        """A motion, or none, followed by the final one between two epochs without a gap."""
-        known_ns = int(self.reached_ns(np.array([end_ns]))[0])
-        more = motion_over(rows, self._sensors, at_ns, end_ns, known_ns, bias, _in_frame(motion, earth))
-        return more if motion is None else motion.then(more)
+        Over gaps between epochs it goes by bridges; between gaps it is one sum of steps.
+        """
+        rows, sensors = self._rows().known(known_ns), self._sensors
+        epochs_ns = self.epochs(start_ns - 1, known_ns)
+        epochs_ns = epochs_ns[: epochs_ns.searchsorted(end_ns, side="right")]
+        newest_ns = int(epochs_ns[-1]) if len(epochs_ns) else start_ns
+        of, kept = (start_ns, bias.tobytes(), earth.tobytes()), self._kept
+        if kept is None or kept[0] != of or kept[2].until_ns > newest_ns:
+            kept = of, None, Stretch(start_ns, start_ns)
+        _, before, stretch = kept
+        new_ns = epochs_ns[epochs_ns.searchsorted(stretch.until_ns) :]
+        for k in np.flatnonzero(np.diff(new_ns) > sensors.longest_ns).tolist():
+            lost_ns, found_ns = int(new_ns[k]), int(new_ns[k + 1])
+            _, before = self._followed(before, stretch, rows, lost_ns, bias, earth)
+            over = bridge(rows, sensors, lost_ns, found_ns, True, bias, _in_frame(before, earth))
+            before, stretch = _joined(before, over), Stretch(found_ns, found_ns)
+        if stretch.until_ns < newest_ns:
+            stretch, _ = self._followed(before, stretch, rows, newest_ns, bias, earth)
+        self._kept = of, before, stretch
+        is_lost = len(epochs_ns) > 0 and self.is_gap(newest_ns, end_ns)
+        _, motion = self._followed(before, stretch, rows, newest_ns if is_lost else end_ns, bias, earth)
+        if is_lost:
+            return _joined(motion, bridge(rows, sensors, newest_ns, end_ns, False, bias, _in_frame(motion, earth)))
+        return motion or motion_over(rows, sensors, start_ns, start_ns, bias, earth)
+
+    def _followed(
+        self, before: PreintegratedMotion | None, stretch: Stretch, rows: Rows, end_ns: int, bias: Floats, earth: Floats
+    ) -> tuple[Stretch, PreintegratedMotion | None]:
+        """A stretch continued to an instant, and the motion before, or none, followed by it; none if nothing passed."""
+        if stretch.start_ns == end_ns:
+            return stretch, before
+        stretch, motion = continued(stretch, rows, self._sensors, end_ns, bias, _in_frame(before, earth))
+        return stretch, _joined(before, motion)
+
+
+def _joined(before: PreintegratedMotion | None, motion: PreintegratedMotion) -> PreintegratedMotion:
+    """A motion, or none, followed by another."""
+    return motion if before is None else before.then(motion)
 
 
 def _in_frame(motion: PreintegratedMotion | None, earth: Floats) -> Floats:

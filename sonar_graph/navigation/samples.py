@@ -19,15 +19,15 @@ samples of 5 mm/s at 7 Hz, short enough for an accelerometer's bias not to have 
 
 
 class StampedRows:
-    """Rows of one sensor in the order of their stamps, each stamp once, with two values per row.
+    """Rows of one sensor in the order of their stamps, each stamp once, with columns of values.
 
-    ``one``, ``other``: shapes of either value's rows.
+    ``values``: the columns, empty.
     """
 
-    def __init__(self, one: tuple[int, ...], other: tuple[int, ...]) -> None:
-        self._show(0, np.empty(0, np.int64), np.empty((0, *one)), np.empty((0, *other)))
+    def __init__(self, *values: NDArray[Any]) -> None:
+        self._show(0, np.empty(0, np.int64), *values)
 
-    def insert(self, stamps_ns: Ints, one: Floats, other: Floats) -> bool:
+    def insert(self, stamps_ns: Ints, *values: NDArray[Any]) -> bool:
         """Place rows by their increasing stamps; of equal stamps the first counts.
 
         Returns True where the first row comes before a row that was there already, or repeats its stamp.
@@ -37,7 +37,8 @@ class StampedRows:
         columns = self._columns
         if end > len(columns[0]):  # room for as many rows again
             columns = [np.concatenate([old[:n], np.empty((end, *old.shape[1:]), old.dtype)]) for old in columns]
-        columns[0][n:end], columns[1][n:end], columns[2][n:end] = stamps_ns, one, other
+        for column, new in zip(columns, (stamps_ns, *values), strict=True):
+            column[n:end] = new
         self._show(end, *columns)
         if not comes_after:
             kept = np.unique(self.stamps_ns, return_index=True)[1]
@@ -49,11 +50,11 @@ class StampedRows:
         first = max(int(np.searchsorted(self.stamps_ns, stamp_ns)) - 1 - more, 0)
         self._show(len(self.stamps_ns) - first, *(column[first:] for column in self._columns))
 
-    def _show(self, n: int, stamps_ns: Ints, one: Floats, other: Floats) -> None:
+    def _show(self, n: int, *columns: NDArray[Any]) -> None:
         """Take columns, of which the first n rows are filled."""
-        self._columns: list[NDArray[Any]] = [stamps_ns, one, other]
-        self.stamps_ns: Ints = stamps_ns[:n]
-        self.values: tuple[Floats, Floats] = one[:n], other[:n]
+        self._columns = list(columns)
+        self.stamps_ns: Ints = columns[0][:n]
+        self.values = tuple(column[:n] for column in columns[1:])
 
 
 UNITS_NS = {"seconds": 1_000_000_000, "milliseconds": 1_000_000, "microseconds": 1_000}

@@ -30,10 +30,18 @@ class Rows(NamedTuple):
     """Velocity of the DVL's origin, shape (n, 3), m/s."""
     cov: Floats
     """Its covariance, shape (n, 3, 3), m²/s²."""
+    known_ns: Ints
+    """Stamps from which they are known: their own, or of the rows that completed or confirmed them; in order."""
     hold_past: bool
     """True where a sample is the mean over the interval that ends at its stamp; else linear."""
     turns: Turns
     """Model of the turn in holes of the IMU."""
+
+    def known(self, at_ns: int) -> Rows:
+        """Rows known at an instant, and the first of the Doppler log."""
+        i, k = self.imu_ns.searchsorted(at_ns, side="right"), max(self.known_ns.searchsorted(at_ns, side="right"), 1)
+        imu_ns, rate, force, dvl_ns, velocity, cov, known_ns, hold_past, turns = self
+        return Rows(imu_ns[:i], rate[:i], force[:i], dvl_ns[:k], velocity[:k], cov[:k], known_ns[:k], hold_past, turns)
 
 
 class Step(NamedTuple):

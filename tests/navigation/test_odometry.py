@@ -1,5 +1,6 @@
 """Odometry: nodes and steps by stamps alone, running motion, motion between any two instants."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import gtsam
@@ -8,12 +9,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from baselines.dead_reckoning import DeadReckoning
+from baselines.ekf_slam import EkfSlam
+from baselines.invariant_ekf import InvariantEkf
 from sonar_graph.calibration import ROWS_BEFORE, Calibration, DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation import Odometry, PreintegratedMotion, dvl_gaps
 from sonar_graph.navigation import odometry as odometry_module
 from sonar_graph.navigation.samples import longest_interval_ns
+from sonar_graph.simulation import MissionOptions, simulate_mission
+from sonar_graph.slam import Isam2
 
 from .rows import NS, T0_NS, at, dvl, imu, stamps, waves
 from .ways import DVL, NOISY, QUIET, Vehicle
@@ -256,19 +262,118 @@ def swaying(interpolation: str = "linear", earth: np.ndarray | None = None) -> O
     return odometry
 
 
-@pytest.mark.parametrize("interpolation", ["linear", "hold-past"])
+def without(rows, *spans_s: tuple[float, float]):
+    """Rows but those within some spans."""
+    t = (rows.stamps_ns - T0_NS) * 1e-9
+    return rows.rows(np.all([(t <= begin) | (t >= end) for begin, end in spans_s], axis=0))
+
+
+def flickering(rows: Dvl, *spans_s: tuple[float, float]) -> Dvl:
+    """Rows of which those within some spans measured the vertical velocity alone."""
+    whole = np.isin(rows.stamps_ns, without(rows, *spans_s).stamps_ns)[:, None]
+    cov = np.where(whole[:, :, None], 1e-4 * np.eye(3), np.diag([1e4, 1e4, 1e-4]))
+    return Dvl(rows.stamps_ns, np.where(whole, rows.velocity, rows.velocity * [0.0, 0.0, 1.0]), cov)
+
+
+SURGING = Vehicle().rows()
+EVERYWHERE = Vehicle().imu(stamps(50.0, 12.1)), Vehicle().dvl(stamps(5.0, 12.0, 0.003))
+UNFELT = Imu(EVERYWHERE[0].stamps_ns, EVERYWHERE[0].angular_velocity, np.full((606, 3), np.nan))
+CUT = {
+    "plain": EVERYWHERE,
+    "a long gap, whose end is confirmed": SURGING,
+    "two short gaps": (EVERYWHERE[0], without(EVERYWHERE[1], (3.1, 5.3), (6.5, 8.9))),
+    "gaps without force": (UNFELT, without(EVERYWHERE[1], (3.1, 5.3), (6.5, 8.9))),
+    "holes of the IMU": (without(EVERYWHERE[0], (2.0, 2.4), (5.0, 7.2)), without(EVERYWHERE[1], (6.5, 8.9))),
+    "few beams": (EVERYWHERE[0], flickering(EVERYWHERE[1], (0.3, 0.7), (2.0, 2.7), (4.0, 6.6), (7.0, 7.3))),
+    "few beams about a gap": (SURGING[0], flickering(SURGING[1], (4.9, 6.3), (15.0, 17.1))),
+    "fast, so that ten velocities confirm": (
+        EVERYWHERE[0],
+        Dvl(EVERYWHERE[1].stamps_ns, EVERYWHERE[1].velocity + np.array([5.0, 0, 0]), EVERYWHERE[1].velocity_cov),
+    ),
+}
+
+
+def answers(odometry: Odometry, until_ns: int, asked_ns: int) -> list[np.ndarray]:
+    """What is told at an instant: epochs, and motions from the first and others, to epochs and another instant."""
+    if (first_ns := odometry.start_by(until_ns)) is None:
+        return []
+    epochs_ns = odometry.epochs(first_ns - 1, until_ns)
+    reached_ns, newest_ns, middle_ns = odometry.reached_ns(epochs_ns), epochs_ns[-1], epochs_ns[len(epochs_ns) // 2]
+    asked_ns = min(max(asked_ns, reached_ns[0]), until_ns)
+    starts_ns = first_ns, middle_ns, (newest_ns + until_ns) // 2
+    found = [odometry.motion(first_ns, asked_ns, BIAS, np.eye(3), asked_ns)]
+    found += [odometry.motion(start_ns, until_ns, BIAS, np.eye(3), until_ns) for start_ns in starts_ns]
+    found += [odometry.motion(start_ns, newest_ns, BIAS, np.eye(3)) for start_ns in (first_ns, middle_ns)]
+    parts = [(m.i_T_j.matrix(), m.covariance, m.D_bias, m.mean_specific_force, [m.duration_s]) for m in found]
+    many = odometry.motions(
+        np.append(epochs_ns[:-1], newest_ns),
+        np.append(epochs_ns[1:], until_ns),
+        np.append(reached_ns[1:], until_ns),
+        BIAS,
+    )
+    return [epochs_ns, reached_ns, *map(np.asarray, sum(parts, ())), *many]
+
+
+@pytest.mark.parametrize("rows", CUT.values(), ids=CUT.keys())
 @pytest.mark.parametrize("earth", [None, np.array([0.02, -0.03, 0.05])], ids=["no Earth", "Earth"])
-@given(offsets=st.lists(st.integers(0, round((SECONDS - 0.3) * NS)), min_size=1, max_size=8))
-@settings(max_examples=15)
-def test_motion_asked_for_later_and_later_instants_is_that_asked_for_at_once(interpolation, earth, offsets):
-    """Between epochs, on them, the same one twice, and an earlier one again; with an Earth that turns a lot."""
-    running = swaying(interpolation, earth)
-    for offset in [*sorted(offsets), offsets[0]]:
-        until_ns = T0_NS + offset
-        assert_same(
-            running.motion(T0_NS, until_ns, BIAS, np.eye(3)),
-            swaying(interpolation, earth).motion(T0_NS, until_ns, BIAS, np.eye(3)),
-        )
+@given(st.lists(st.tuples(st.integers(0, 20_200), st.integers(0, 20_200), st.booleans()), min_size=1, max_size=8))
+@settings(max_examples=25)
+def test_how_rows_are_cut_and_what_is_asked_in_between_change_no_bit(rows, earth, calls):
+    """Also what comes in long before it is asked for, and what is kept of another question."""
+    calibration = Calibration(imu=NOISY, dvl=DVL)
+    pieces, after_ns = Odometry(calibration), 0
+    pieces._earth = earth
+    for until_ms, asked_ms, is_asked in sorted(calls):
+        until_ns, asked_ns = T0_NS + until_ms * 1_000_000, T0_NS + asked_ms * 1_000_000
+        pieces.add(*(block.between(after_ns, until_ns) for block in rows))
+        after_ns = until_ns
+        if is_asked:
+            whole = odometry_of(*rows, calibration)
+            whole._earth = earth
+            told, known = answers(pieces, until_ns, asked_ns), answers(whole, until_ns, asked_ns)
+            assert len(told) == len(known)
+            for one, other in zip(told, known, strict=True):
+                assert np.array_equal(one, other, equal_nan=True)
+
+
+def test_a_row_that_is_completed_later_is_not_known_before():
+    """Nor is what it changes; and two motions composed differ from the one in the last bits."""
+    odometry = odometry_of(*CUT["few beams"], Calibration(imu=NOISY, dvl=DVL))
+    found = [odometry.motion(at(3.803), at(5.5), ZERO, None, at(known_s)) for known_s in (5.5, 6.602, 6.7, 8.0)]
+    assert same(found[0], found[1])
+    assert not found[1].i_T_j.equals(found[2].i_T_j, 1e-6)
+    assert same(found[2], found[3])
+    assert odometry.reached_ns(np.array([at(4.403)])) == at(6.603)
+    assert at(4.403) not in odometry.epochs(0, at(6.602))
+    assert at(4.403) in odometry.epochs(0, at(6.603))
+    one, first, second = (
+        odometry.motion(at(a), at(b), BIAS) for a, b in ((1.003, 3.003), (1.003, 2.803), (2.803, 3.003))
+    )
+    assert_same(first.then(second), one)
+    assert not same(first.then(second), one)
+
+
+@pytest.mark.parametrize("kind", [DeadReckoning, EkfSlam, InvariantEkf, Isam2])
+def test_an_estimate_is_the_same_to_the_bit_however_the_log_is_cut(kind):
+    """With few beams, gaps that are confirmed and short ones, and holes of the IMU; the last estimate tells."""
+    options = MissionOptions(duration_s=40.0, landmarks=12, dvl="explorer", imu="mti1")
+    mission = simulate_mission(options)
+    offset_ns = T0_NS - mission.start_ns
+    moved = replace(mission.dvl, stamps_ns=mission.dvl.stamps_ns + offset_ns)
+    log = flickering(without(moved, (12.0, 16.0), (20.0, 22.5)), (5.0, 7.0), (10.0, 12.1), (25.0, 25.6))
+    inertial = without(replace(mission.imu, stamps_ns=mission.imu.stamps_ns + offset_ns), (8.0, 8.3), (28.0, 30.2))
+    log, inertial = (replace(rows, stamps_ns=rows.stamps_ns - offset_ns) for rows in (log, inertial))
+    mission = replace(mission, imu=inertial, dvl=log)
+    ends_ns = mission.start_ns + np.array([11, 14, 24, 33]) * NS + 7_000_000
+    rng, found = np.random.default_rng(0), []
+    for cuts in (0, 5, 60):
+        instants = np.union1d(ends_ns, mission.start_ns + rng.integers(0, 33 * NS, cuts))
+        estimator = kind(mission.calibration, Odometry(mission.calibration))
+        told = {window.end_ns: estimator.process(window) for window in mission.replay(instants)}
+        found.append([(told[t].world_T_body.matrix(), told[t].covariance) for t in ends_ns.tolist()])
+    for other in found[1:]:
+        assert np.array_equal(np.array([P for _, P in found[0]]), np.array([P for _, P in other]))
+        assert np.array_equal(np.array([T for T, _ in found[0]]), np.array([T for T, _ in other]))
 
 
 def test_what_is_kept_is_not_used_for_another_bias_or_start_or_after_earlier_rows():
@@ -294,15 +399,15 @@ def test_what_is_final_is_not_integrated_again(monkeypatch):
     """Of twenty instants a second for two seconds, each takes in the rows of one Doppler interval and a bit."""
     spans_s: list[float] = []
 
-    def counted(*interval):
-        spans_s.append((interval[3] - interval[2]) * 1e-9)
-        return dvl_gaps.motion_over(*interval)
+    def counted(so_far, rows, sensors, end_ns, *noise):
+        spans_s.append((end_ns - so_far.until_ns) * 1e-9)
+        return dvl_gaps.continued(so_far, rows, sensors, end_ns, *noise)
 
-    monkeypatch.setattr(odometry_module, "motion_over", counted)
+    monkeypatch.setattr(odometry_module, "continued", counted)
     odometry = swaying()
-    for offset in range(0, 2 * NS, NS // 20):
+    for offset in range(NS // 2, 2 * NS, NS // 20):
         odometry.motion(T0_NS, T0_NS + offset, BIAS)
-    assert max(spans_s) < 0.3
+    assert 0.0 < max(spans_s[1:]) < 0.3
 
 
 @given(st.integers(1, 95), st.integers(1, 95))

@@ -28,7 +28,7 @@ from .rows import NS, T0_NS, dvl, imu, odometry_at_rest, stamps
 
 def kept(*blocks: list[int]) -> samples.StampedRows:
     """Values are the number of the block, so that it is seen which of equal stamps is there."""
-    rows = samples.StampedRows((3,), (3, 3))
+    rows = samples.StampedRows(np.empty((0, 3)), np.empty((0, 3, 3)))
     for number, block in enumerate(blocks):
         n = len(block)
         rows.insert(np.array(block), np.full((n, 3), float(number)), np.full((n, 3, 3), float(-number)))

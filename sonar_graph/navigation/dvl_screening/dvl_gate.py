@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.navigation.dvl_screening.partial_beams import Rows
-from sonar_graph.navigation.samples import EARLIEST_NS, LATEST_NS, PARTIAL_M2_S2
+from sonar_graph.navigation.samples import LATEST_NS, PARTIAL_M2_S2
 from sonar_graph.navigation.steps import covariance, rows_until
 from sonar_graph.navigation.steps import row as row_of
 from sonar_graph.numerics import O3, ZERO, Mat3, Vec3, compiled, inlined
@@ -136,8 +136,6 @@ class VelocityConfirmation:
     def __init__(self, walk: float) -> None:
         self._walk = walk
         self._recent_ns: list[int] = []
-        self.start_known_ns = EARLIEST_NS
-        """Instant at which the first velocity was confirmed."""
         self._waiting: list[WaitingRow] = []
 
     @property
@@ -212,7 +210,6 @@ class VelocityConfirmation:
                 found.append(WaitingRow(row.stamp_ns, first.velocity, first.cov + may_change * np.eye(3), False))
         self._waiting = [row for row in self._waiting if row.stamp_ns > end_ns]
         if is_start:
-            self.start_known_ns = end_ns
             return found
         refused += [RefusedRow("dvl", row.stamp_ns, Refusal.WAITED, np.nan) for row in found[:-1]]
         return found[-1:]

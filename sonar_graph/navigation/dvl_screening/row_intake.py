@@ -4,6 +4,9 @@ A row is turned into body axes and placed by its stamp. A velocity whose covaria
 a row of a motion that was already used is late. A velocity that no vehicle reaches is an outlier, and one with none
 before it waits until others confirm it (`sonar_graph.navigation.dvl_screening.dvl_gate`). One of too few beams waits
 until it can be completed (`sonar_graph.navigation.dvl_screening.partial_beams`).
+
+A row is known from its own stamp on, one that waited from that of the row that completed or confirmed it. So what is
+known at an instant follows from stamps, not from the calls in which rows came.
 """
 
 from typing import TypeVar
@@ -41,10 +44,10 @@ class RowIntake:
         self._walk = calibration.dvl.velocity_walk_density
         self._confirmation = None if is_held else VelocityConfirmation(self._walk)
         self._partial = PartialVelocities(calibration)
-        self.imu = StampedRows((3,), (3,))
+        self.imu = StampedRows(np.empty((0, 3)), np.empty((0, 3)))
         """Angular rate and specific force, body axes."""
-        self.dvl = StampedRows((3,), (3, 3))
-        """Velocity of the DVL's origin and its covariance, body axes."""
+        self.dvl = StampedRows(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0, np.int64))
+        """Velocity of the DVL's origin and its covariance, body axes, and the stamp from which they are known."""
         self.settled_ns: int = EARLIEST_NS
         """Stamp up to which motion is used and final."""
         self._refused: list[RefusedRow] = []
@@ -58,11 +61,6 @@ class RowIntake:
             *(RefusedRow("dvl", at_ns, Refusal.INCOMPLETE, np.nan) for at_ns in self._partial.not_completed_ns),
             *(RefusedRow("dvl", at_ns, Refusal.UNCONFIRMED, np.nan) for at_ns in waiting),
         ]
-
-    @property
-    def start_known_ns(self) -> int:
-        """Instant at which the first velocity was confirmed."""
-        return self._confirmation.start_known_ns if self._confirmation else EARLIEST_NS
 
     def add_imu(self, imu: Imu) -> bool:
         """Take in rows; True where some were placed before others that were there already."""
@@ -109,15 +107,17 @@ class RowIntake:
             if len(confirmed[0]):
                 again = self._gated(confirmed)
                 confirmation.accept(confirmed[0][~(again.is_outlier | again.is_partial)])
-                was_placed_before |= self._place(confirmed, again)
+                was_placed_before |= self._place(confirmed, again, int(stamp_ns))
         return was_placed_before
 
     def _gated(self, rows: Rows) -> GateResult:
         """Compare rows with those placed already."""
-        return gate_velocities(*rows, self.dvl.stamps_ns, *self.dvl.values, self._walk, self._gate)
+        velocity, cov, _ = self.dvl.values
+        return gate_velocities(*rows, self.dvl.stamps_ns, velocity, cov, self._walk, self._gate)
 
-    def _place(self, rows: Rows, result: GateResult) -> bool:
+    def _place(self, rows: Rows, result: GateResult, confirmed_ns: int = EARLIEST_NS) -> bool:
         """Complete and place rows that are no outliers; True as for `add_imu`."""
+        known_ns = rows[0]
         if result.is_plain and not self._partial.is_waiting:
             self._partial.remember(*rows)
         else:
@@ -127,7 +127,14 @@ class RowIntake:
             inertial = InertialRows(self.imu.stamps_ns, *self.imu.values)
             accepted = stamps_ns[~outlier], velocity[~outlier], cov[~outlier]
             rows = self._partial.completed(*accepted, result.is_partial[~outlier], inertial)
-        return len(rows[0]) > 0 and self.dvl.insert(*rows)
+            whole_ns = accepted[0][~result.is_partial[~outlier]]
+            known_ns = whole_ns[whole_ns.searchsorted(rows[0])]
+        if not len(rows[0]):
+            return False
+        was_placed_before = self.dvl.insert(*rows, np.maximum(known_ns, confirmed_ns))
+        if was_placed_before:  # a row is known no earlier than those before it
+            np.maximum.accumulate(self.dvl.values[2], out=self.dvl.values[2])
+        return was_placed_before
 
     def _in_time(self, rows: _Rows, known_ns: Ints, sensor: str) -> _Rows | None:
         """Rows that are not late, each stamp once."""
