@@ -135,11 +135,12 @@ class Keyframes:
         self.odometry.add(imu, dvl)
         self._latest = None
         newest_ns = self._depths[-1].stamps_ns[-1] if self._depths else EARLIEST_NS
-        if depth is not None and depth.stamps_ns[0] < newest_ns:
+        if depth is not None and depth.stamps_ns[0] <= newest_ns:
             late = depth.stamps_ns[depth.stamps_ns < newest_ns]
             self._refused += [RefusedRow("depth", stamp_ns, Refusal.LATE, np.nan) for stamp_ns in late.tolist()]
-        if depth is not None and (in_order := depth.between(newest_ns, LATEST_NS)):
-            self._depths.append(in_order)
+            depth = depth.between(newest_ns, LATEST_NS)
+        if depth is not None:
+            self._depths.append(depth)
 
     @property
     def refused(self) -> list[RefusedRow]:

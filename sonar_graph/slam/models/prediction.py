@@ -16,6 +16,8 @@ from sonar_graph.navigation import PreintegratedMotion
 from sonar_graph.slam.models.views import project_all
 from sonar_graph.slam.smoother import JointCovariance
 
+IDENTITY = np.eye(2)
+
 
 @dataclass(frozen=True, eq=False)
 class ComparedRow:
@@ -134,7 +136,7 @@ class PredictedView:
         The motion's part is added to each variance; that it correlates range and azimuth a little is left out.
         """
         H_M = project_all(points, self.world_T_sonar.matrix())[1] @ self._by_body
-        return cov + np.eye(2) * (H_M @ motion.covariance * H_M).sum(axis=2)[:, None]
+        return cov + IDENTITY * (H_M @ motion.covariance * H_M).sum(axis=2)[:, None]
 
 
 def weigh(z: Floats, expected: Floats, prior_cov: Floats, cov: Floats) -> ComparedRow:
@@ -149,5 +151,5 @@ def weigh(z: Floats, expected: Floats, prior_cov: Floats, cov: Floats) -> Compar
 
 def _height_derivative(world_T_body: gtsam.Pose3, point: Floats) -> Floats:
     """Derivative of the world z of a point of the body by the right perturbation of its pose, shape (6,)."""
-    up = world_T_body.rotation().matrix()[2]
-    return np.concatenate([np.cross(world_T_body.transformTo(point), up), up])
+    (x, y, z), (a, b, c) = world_T_body.transformTo(point).tolist(), world_T_body.rotation().matrix()[2].tolist()
+    return np.array([y * c - z * b, z * a - x * c, x * b - y * a, a, b, c])

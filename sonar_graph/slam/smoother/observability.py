@@ -73,7 +73,8 @@ def left_open(
         size += tangent_size(key)
     if not size:
         return []
-    A = np.vstack([np.zeros((1, size)), *(_rows(graph.at(i), values, places, least_said) for i in range(graph.size()))])
+    factors = [factor for factor in map(graph.at, range(graph.size())) if not places.keys().isdisjoint(factor.keys())]
+    A = np.vstack([np.zeros((1, size)), *(_rows(factor, values, places, least_said) for factor in factors)])
     if not np.isfinite(A).all():
         return []
     lengths = np.linalg.norm(A, axis=0)
@@ -92,12 +93,9 @@ def left_open(
 
 def _rows(factor: gtsam.NonlinearFactor, values: gtsam.Values, places: dict[int, slice], least_said: float) -> Floats:
     """A factor's whitened rows in the columns of the variables that are not known."""
-    factor_keys, size = list(factor.keys()), max(place.stop for place in places.values())
-    if not any(key in places for key in factor_keys):
-        return np.zeros((0, size))
     linear = factor.linearize(values)
     A, _ = linear.jacobian()
-    rows, column = np.zeros((len(A), size)), 0
+    rows, column = np.zeros((len(A), max(place.stop for place in places.values()))), 0
     for key in list(linear.keys()):
         if key in places:
             rows[:, places[key]] += A[:, column : column + tangent_size(key)]
