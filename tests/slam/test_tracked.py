@@ -2,6 +2,7 @@
 
 from collections import Counter
 from dataclasses import replace
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -12,16 +13,19 @@ from hypothesis import strategies as st
 
 from sonar_graph.calibration import FloorPrior
 from sonar_graph.measurements import NO_TRACK
+from sonar_graph.motion import PreintegratedMotion
+from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
-from sonar_graph.slam import RobustKernel
+from sonar_graph.slam import Isam2, RobustKernel
 from sonar_graph.slam.landmarks.landmark_graph import IN_GRAPH
 from sonar_graph.slam.smoother import incremental as smoother_module
 from sonar_graph.slam.smoother.incremental import Smoother
 from sonar_graph.states import Outcome
-from sonar_graph.testing.laws import EstimatorRun, difference
+from sonar_graph.testing import laws
+from sonar_graph.testing.laws import EstimatorRun, unlike
 
-from .dive import CALIBRATION, NS, T0_NS, TRUSTING, UNGATED, Dive
+from .dive import CALIBRATION, NS, T0_NS, TRUSTING, UNGATED, Dive, spherical
 from .graphs import assert_same_factors, assert_same_graph, factors_of, rows_of
 from .late_identities import (
     BASIN,
@@ -40,7 +44,7 @@ from .late_identities import (
     run,
     see,
 )
-from .made import counted, ran, smoother_with
+from .made import counted, isam2_params, smoother_with
 from .rail import STEP_S, rail
 
 NEARLY_4 = [0.9, 0.0, 0.0, 0.0]
@@ -138,26 +142,75 @@ def test_a_displaced_sighting_is_used_when_its_place_becomes_free_though_its_tra
     assert_same_factors(dive.smoother.graph, known.smoother.graph, known.smoother.values)
 
 
-def answers(policy: str, rate_hz: float) -> EstimatorRun:
-    """Of a run with identities that are late, wrong and missing; estimates at tens of seconds."""
+CUT = {
+    **POLICIES,
+    "plain": {"kernel__shape": "none"},
+    "each alone": {"identity__longest_wait_s": 0.0},
+    "remembered": {"history__policy": "bounded", "history__remembered_s": 40.0, "smoother__lag_s": 3.0},
+    "bounded gate that associates": {
+        "identity__policy": "gate", "identity__unknown__policy": "associate", "identity__longest_wait_s": 2.0,
+        "history__policy": "bounded", "smoother__lag_s": 3.0,
+    },
+    "max-mixture, short": {"identity__policy": "max-mixture", "smoother__lag_s": 3.0},
+    "max-mixture, plain": {"identity__policy": "max-mixture", "kernel__shape": "none", "identity__longest_wait_s": 3.0},
+}  # fmt: skip
+SELDOM_HZ = 0.1
+
+
+def answers(policy: str, seed: int | None, source: type[Odometry] = Odometry) -> EstimatorRun:
+    """At tens of seconds, of identities that are late, wrong and missing.
+
+    Calls every ten seconds, and asked only at the end; with a seed also calls 0.25 to 2 s apart, asked at every eighth.
+    """
     sequence = simulate_basin(BasinOptions(**BASIN, **TROUBLES["late and wrong"], anonymous_share=0.3))
-    estimator, causal = ran(sequence, rate_hz, **POLICIES[policy])
-    tens = {int(stamp_ns) for stamp_ns in sequence.instants(0.1)}
-    told = [estimate for estimate in causal if estimate.stamp_ns in tens]
-    smoothed = estimator.trajectory()
-    at = np.isin(smoothed.stamps_ns, list(tens))
-    return EstimatorRun(told, smoothed.rows(np.flatnonzero(at)), estimator.landmarks(), estimator.detections())
+    instants = tens = sequence.instants(SELDOM_HZ)
+    if seed is not None:
+        apart_s = np.random.default_rng(seed).uniform(0.25, 2.0, 1000)
+        between = tens[0] + np.cumsum(np.round(apart_s * NS).astype(np.int64))
+        instants = np.union1d(tens, between[between < tens[-1]])
+    made = laws.run(
+        lambda calibration, _: Isam2(calibration, source(calibration), isam2_params(**CUT[policy])),
+        sequence, instants, ask_every=0 if seed is None else 8,
+    )  # fmt: skip
+    told = [estimate for estimate in made.estimates if estimate.stamp_ns in tens]
+    return replace(made, estimates=told, trajectory=made.trajectory.rows(np.isin(made.trajectory.stamps_ns, tens)))
 
 
-@pytest.mark.parametrize("policy", POLICIES)
-def test_how_a_log_is_cut_into_calls_changes_nothing(policy: str):
-    """Calls every ten seconds and four a second; motions to an instant that lies between epochs differ by rounding."""
-    seldom, often = answers(policy, 0.1), answers(policy, 4.0)
+@pytest.mark.parametrize("policy", CUT)
+def test_no_bit_depends_on_how_a_log_is_cut_into_calls_or_on_what_is_asked(policy: str):
+    seldom = answers(policy, None)
     assert len(seldom.estimates) > 10
-    assert seldom.detections.outcomes == often.detections.outcomes
-    assert np.array_equal(seldom.detections.landmark_ids, often.detections.landmark_ids)
-    assert np.allclose(seldom.trajectory.positions, often.trajectory.positions, rtol=0, atol=1e-12)
-    assert difference(seldom, often) < 1e-12
+    assert unlike(seldom, answers(policy, 1)) == []
+
+
+class CountingOdometry(Odometry):
+    """Motions that depend in the last digits on how often one was asked for."""
+
+    asked = 0
+
+    def motion(self, *interval: Any) -> PreintegratedMotion:
+        motion = super().motion(*interval)
+        self.asked += 1
+        drift = gtsam.Pose3(gtsam.Rot3(), np.array([1e-13 * self.asked, 0.0, 0.0]))
+        return replace(motion, i_T_j=motion.i_T_j.compose(drift))
+
+
+def test_cut_invariance_sees_a_trillionth_of_a_metre():
+    differing = unlike(answers("robust", None, CountingOdometry), answers("robust", 1, CountingOdometry))
+    assert differing == ["causal estimates", "trajectory()", "landmarks()", "detections()"]
+
+
+@pytest.mark.parametrize("asked", [False, True])
+def test_a_track_that_is_over_decides_no_longer_which_of_its_rows_counts(asked: bool):
+    """Also where nobody asked for the outcomes in between, upon which it is forgotten."""
+    dive = Dive(identity=TRUSTING.model_copy(update={"longest_wait_s": 1.0}))
+    see(dive, 0.0, SURE[5])
+    if asked:
+        dive.keyframes.advance(T0_NS + 3 * NS)
+        dive.sightings.log()
+    z = [spherical(1.5, p) for p in OBJECTS[:2]]
+    dive.show(T0_NS + 3 * NS, z, IDS, [[0.0, 0.75, 0.0, 0.0], [0.0, 0.0, 0.9, 0.0]], [3, 3])
+    assert dive.outcomes[1:] == [Outcome.TRACK_REPEATED, Outcome.NEW]
 
 
 @pytest.mark.parametrize("policy", POLICIES)
