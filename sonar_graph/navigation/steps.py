@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sonar_graph.measurements import Floats, Ints
-from sonar_graph.navigation.imu_gaps import UNFELT_NS, Turns, error_in_hole, hole_ns
+from sonar_graph.navigation.imu_gaps import SHORTEST_NS, UNFELT_NS, Turns, error_in_hole, hole_ns
 from sonar_graph.numerics import ZERO, Mat3, Vec3, inlined
 
 
@@ -57,8 +57,6 @@ class Step(NamedTuple):
     """Spectral density of its noise, m²/s."""
     force: Vec3
     """Specific force at the IMU, m/s²; NaN where not measured."""
-    turn_psd: Vec3
-    """Spectral density of what the rates miss in holes of the IMU, rad²/s; zero elsewhere."""
 
 
 @inlined
@@ -114,13 +112,6 @@ def step_from(rows: Rows, imu_rows: int, dvl_rows: int, i: int, k: int, t: int, 
     if k < dvl_rows:
         until = min(until, dvl_ns[k])
     middle = t + (until - t) // 2
-    f, turn_psd = value_at(imu_ns, rows.force, imu_rows, i, middle, hold_past), ZERO
-    if rows.turns.is_modelled:
-        length_ns = hole_ns(imu_ns, imu_rows, i, until)
-        if length_ns > 0:
-            turn_psd = error_in_hole(rows.turns, imu_ns, imu_rows, i, t, until)
-        if length_ns > UNFELT_NS:
-            f = Vec3(np.nan, np.nan, np.nan)
     last = min(k, dvl_rows - 1)
     other = last if hold_past or k >= dvl_rows or last == 0 else last - 1
     interval_s = (dvl_ns[last] - dvl_ns[last - 1]) * 1e-9 if last > 0 else 0.0
@@ -130,9 +121,27 @@ def step_from(rows: Rows, imu_rows: int, dvl_rows: int, i: int, k: int, t: int, 
         value_at(imu_ns, rows.rate, imu_rows, i, middle, hold_past),
         value_at(dvl_ns, rows.velocity, dvl_rows, k, middle, hold_past),
         interval_s * (0.5 * (covariance(rows.cov, last) + covariance(rows.cov, other))),
-        f,
-        turn_psd,
+        value_at(imu_ns, rows.force, imu_rows, i, middle, hold_past),
     )
+
+
+@inlined
+def may_be_in_hole(rows: Rows, imu_rows: int, i: int, end_ns: int) -> bool:
+    """True where the time between IMU rows around a step is long enough for a hole, row i being the first after it."""
+    if not rows.turns.is_modelled or i == 0:
+        return False
+    return (rows.imu_ns[i] if i < imu_rows else end_ns) - rows.imu_ns[min(i, imu_rows) - 1] > SHORTEST_NS
+
+
+@inlined
+def in_hole(rows: Rows, imu_rows: int, i: int, t: int, step: Step) -> tuple[Step, Vec3]:
+    """Step from t, its force unknown in a long hole of the IMU, and spectral density of its rates' error, rad²/s."""
+    length_ns, turn_psd, force = hole_ns(rows.imu_ns, imu_rows, i, step.until_ns), ZERO, step.force
+    if length_ns > 0:
+        turn_psd = error_in_hole(rows.turns, rows.imu_ns, imu_rows, i, t, step.until_ns)
+    if length_ns > UNFELT_NS:
+        force = Vec3(np.nan, np.nan, np.nan)
+    return Step(step.until_ns, step.duration_s, step.rate, step.velocity, step.Q, force), turn_psd
 
 
 @inlined
