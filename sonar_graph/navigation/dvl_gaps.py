@@ -55,24 +55,17 @@ class Sensors(NamedTuple):
     def of(cls, calibration: Calibration) -> Sensors:
         """Pick the numbers from a calibration."""
         imu, dvl = calibration.imu, calibration.dvl
-        return cls(
-            longest_interval_ns(calibration),
-            imu.gyro_noise_density,
-            imu.accel_noise_density,
-            imu.accel_bias_sigma,
-            dvl.velocity_walk_density,
-            np.array(imu.mounting.translation_m),
-            np.array(dvl.mounting.translation_m),
-        )
+        noise = imu.gyro_noise_density, imu.accel_noise_density, imu.accel_bias_sigma, dvl.velocity_walk_density
+        places = np.array(imu.mounting.translation_m), np.array(dvl.mounting.translation_m)
+        return cls(longest_interval_ns(calibration), *noise, *places)
 
 
 class Stretch(NamedTuple):
-    """Sums of the steps from one instant to another, to be continued."""
+    """Sums of the steps from one instant to another, as in `sonar_graph.navigation.sums`, to be continued."""
 
     start_ns: int
     until_ns: int
     sums: Floats = START
-    """As in `sonar_graph.navigation.sums`."""
 
 
 def motion_over(

@@ -78,7 +78,7 @@ def sums_along(rows: Rows, imu_rows: int, line: Line, R_0: Floats, bias: Floats,
     m = len(line.W)
     R, turned_s, whole = np.empty((3 * m + 3, 3)), np.empty((6 * m, 3)), np.empty(9)
     by_y, by_time, by_a = np.zeros((18, 9)), np.zeros((2, 9)), np.zeros((3, 12))
-    _write_sums(rows, imu_rows, *line, R_0, bias, earth, R, turned_s, whole, by_y, by_time, by_a)
+    _write_sums(rows, imu_rows, line, R_0, bias, earth, R, turned_s, whole, by_y, by_time, by_a)
     return Sums(
         R.reshape(m + 1, 3, 3),
         whole,
@@ -96,13 +96,7 @@ def sums_along(rows: Rows, imu_rows: int, line: Line, R_0: Floats, bias: Floats,
 def _write_sums(
     rows: Rows,
     imu_rows: int,
-    cuts_ns: Ints,
-    is_inertial: bool,
-    W: Floats,
-    jumps: Floats,
-    v_start: Floats,
-    v_end: Floats,
-    origin_ns: int,
+    line: Line,
     R_0: Floats,
     bias: Floats,
     earth: Floats,
@@ -114,6 +108,7 @@ def _write_sums(
     by_a: Floats,
 ) -> None:
     """Fill the columns of `Sums`, matrices one below the other (views of arrays are slow to compile)."""
+    cuts_ns, is_inertial, W, jumps, v_start, v_end, origin_ns = line
     imu_ns, m, y, r, a = rows.imu_ns, len(W), np.empty(9), np.empty(9), np.empty(3)
     R, v, p, s, b, E = mat(R_0), ZERO, ZERO, ZERO, vec(bias), vec(earth)
     t, T = cuts_ns[0], (cuts_ns[m] - origin_ns) * 1e-9

@@ -62,39 +62,13 @@ RULES: dict[DopplerRule, Rule | None] = {
 }
 """Others than "inertial" and "linear" are those of other projects, for comparison (docs/theory/preintegration.md)."""
 LONG_S = 0.4
-"""Interval of Doppler samples above which the rule "inertial" takes the log's way about the IMU's point from the
-gyros."""
-
-
-def refuse_beyond(longest_s: float, dvl_ns: Ints) -> None:
-    """Raise MeasurementError where Doppler samples are too far apart for a velocity that they alone shape."""
-    between_ns = np.diff(dvl_ns)
-    k = int(between_ns.argmax())
-    if between_ns[k] > longest_s * 1e9:
-        raise MeasurementError(
-            f"Dvl.stamps_ns: no row for {between_ns[k] * 1e-9:.3g} s after {dvl_ns[k]} ns, more than longest_s"
-            f' ({longest_s:g} s); use the rule "inertial", or let sonar_graph.navigation.odometry.Odometry bridge it'
-        )
-
-
-def refuse_holes(longest_s: float, imu_ns: Ints, first: int, last: int) -> None:
-    """Raise MeasurementError where inertial rows, from one row to another, have a hole."""
-    row = row_after_hole(imu_ns, first, last, round(longest_s * 1e9))
-    if row >= 0:
-        raise MeasurementError(
-            f"Imu.stamps_ns: no row for {(imu_ns[row] - imu_ns[row - 1]) * 1e-9:.3g} s after {imu_ns[row - 1]} ns: the"
-            " turn in there is not measured; begin a motion after it, let sonar_graph.navigation.odometry.Odometry"
-            f" bridge it, or set longest_hole_s ({longest_s:g} s) higher if the vehicle hardly turns"
-        )
+"""Interval of Doppler samples above which "inertial" takes the log's way about the IMU's point from the gyros."""
 
 
 def with_rate_noise(cov: Floats, dvl_ns: Ints, imu_ns: Ints, gyro_density: float, arm: Floats) -> Floats:
-    """Covariances of ``z - w x l`` at samples that begin or end a long interval, of z at others.
+    """Covariances (n, 3, 3) of ``z - w x l`` at samples that begin or end a long interval, of z at others.
 
-    ``cov``: covariances of the samples z, body axes, shape (n, 3, 3), m²/s²; ``gyro_density``: noise density of the
-    gyros, rad/s/√Hz; ``arm``: l, from the IMU to the Doppler log, body axes, shape (3,), m.
-
-    Returns shape (n, 3, 3), m²/s²: more by ``n_g² / dt [l]x [l]x^T`` with the mean time dt between inertial rows.
+    More by ``n_g² / dt [l]x [l]x^T`` with the mean time dt between inertial rows; ``arm``: l, from the IMU to the log.
     """
     is_long = np.diff(dvl_ns) > LONG_S * 1e9
     if not is_long.any():
@@ -117,20 +91,6 @@ class JointMotion:
 
     Errors are ``[theta, dv, dp, ds]``: theta in frame j (``R Exp(theta)``), the others added in frame i. Where the
     specific force was not measured, velocity, position, and their covariances and derivatives are NaN.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from sonar_graph.measurements import Dvl, Imu
-    >>> from sonar_graph.navigation import JointPreintegrator
-    >>> imu_ns, dvl_ns = np.arange(401) * 5_000_000, np.arange(11) * 200_000_000
-    >>> imu = Imu(imu_ns, np.zeros((401, 3)), np.tile([0.0, 0.0, 9.81], (401, 1)))
-    >>> dvl = Dvl(dvl_ns, np.tile([0.5, 0.0, 0.0], (11, 1)), np.full((11, 3, 3), np.nan))
-    >>> sensors = JointPreintegrator(gyro_noise_density=1e-4, accel_noise_density=1e-3)
-    >>> first = sensors.integrate(imu, dvl, 0, 1_000_000_000)
-    >>> second = sensors.integrate(imu, dvl, 1_000_000_000, 2_000_000_000).after(first)
-    >>> round(float(second.relative_pose().i_T_j.x()), 6)
-    0.5
     """
 
     i_R_j: gtsam.Rot3
@@ -196,13 +156,7 @@ class JointMotion:
         return replace(self, shared_covariance=C + C.T)
 
     def corrected(self, change: Floats) -> JointMotion:
-        """The motion for other parameters, to first order.
-
-        Parameters
-        ----------
-        change
-            Change of gyro bias, accelerometer bias, scale and mounting, shape (10,).
-        """
+        """The motion for other gyro bias, accelerometer bias, scale and mounting, by a change (10,) to first order."""
         error = self.D_parameters @ finite_vector("change", change, 10)
         return replace(
             self,
@@ -249,13 +203,14 @@ class JointPreintegrator:
     >>> import numpy as np
     >>> from sonar_graph.measurements import Dvl, Imu
     >>> from sonar_graph.navigation import JointPreintegrator
-    >>> imu_ns, dvl_ns = np.arange(201) * 5_000_000, np.arange(6) * 200_000_000
-    >>> imu = Imu(imu_ns, np.zeros((201, 3)), np.tile([0.0, 0.0, 9.81], (201, 1)))
-    >>> dvl = Dvl(dvl_ns, np.tile([0.5, 0.0, 0.0], (6, 1)), np.full((6, 3, 3), np.nan))
+    >>> imu_ns, dvl_ns = np.arange(401) * 5_000_000, np.arange(11) * 200_000_000
+    >>> imu = Imu(imu_ns, np.zeros((401, 3)), np.tile([0.0, 0.0, 9.81], (401, 1)))
+    >>> dvl = Dvl(dvl_ns, np.tile([0.5, 0.0, 0.0], (11, 1)), np.full((11, 3, 3), np.nan))
     >>> sensors = JointPreintegrator(gyro_noise_density=1e-4, accel_noise_density=1e-3)
-    >>> motion = sensors.integrate(imu, dvl, 0, 1_000_000_000)
-    >>> round(float(motion.displacement[0]), 6), motion.covariance.shape
-    (0.5, (12, 12))
+    >>> first = sensors.integrate(imu, dvl, 0, 1_000_000_000)
+    >>> second = sensors.integrate(imu, dvl, 1_000_000_000, 2_000_000_000).after(first)
+    >>> round(float(second.displacement[0]), 6), round(float(second.relative_pose().i_T_j.x()), 6)
+    (0.5, 0.5)
     """
 
     gyro_noise_density: float
@@ -287,21 +242,12 @@ class JointPreintegrator:
     def from_calibration(cls, calibration: Calibration, rule: DopplerRule = "inertial") -> JointPreintegrator:
         """Pick the numbers from a calibration.
 
-        ``earth_rate_latitude_rad`` is not among them: what the Earth's rotation is in body frame i depends on the
-        attitude there, so `integrate` takes it anew for each motion,
-        ``world_T_i.rotation().unrotate(earth_rate_in_world(calibration))``
-        (`sonar_graph.navigation.alignment.gravity`).
+        ``earth_rate_latitude_rad`` is not among them: the Earth's rotation in body frame i depends on the attitude
+        there, so `integrate` takes it anew, ``world_T_i.rotation().unrotate(earth_rate_in_world(calibration))``.
         """
         imu, dvl = calibration.imu, calibration.dvl
-        return cls(
-            imu.gyro_noise_density,
-            imu.accel_noise_density,
-            dvl.velocity_sigma_m_s,
-            imu.mounting.pose(),
-            dvl.mounting.pose(),
-            rule,
-            dvl.gap_s,
-        )
+        noise = imu.gyro_noise_density, imu.accel_noise_density, dvl.velocity_sigma_m_s
+        return cls(*noise, imu.mounting.pose(), dvl.mounting.pose(), rule, dvl.gap_s)
 
     def integrate(
         self,
@@ -349,23 +295,21 @@ class JointPreintegrator:
         if self.rule == "inertial":
             cov = with_rate_noise(cov, samples.stamps_ns, inertial.stamps_ns, self.gyro_noise_density, arm)
         else:
-            refuse_beyond(self.longest_s, samples.stamps_ns)
+            between_ns = np.diff(samples.stamps_ns)
+            k = int(between_ns.argmax())
+            if between_ns[k] > self.longest_s * 1e9:
+                raise MeasurementError(
+                    f"Dvl.stamps_ns: no row for {between_ns[k] * 1e-9:.3g} s after {samples.stamps_ns[k]} ns, more than"
+                    f' longest_s ({self.longest_s:g} s); use the rule "inertial", or let'
+                    " sonar_graph.navigation.odometry.Odometry bridge it"
+                )
         bias = np.zeros(6) if bias is None else finite_vector("bias", bias, 6)
         earth = np.zeros(3) if earth_rate is None else finite_vector("earth_rate", earth_rate, 3)
         force = inertial.specific_force @ body_R_imu.T
         if self.rule == "inertial" and not np.isfinite(force).all():
             raise MeasurementError('Imu.specific_force: not measured in every row; use the rule "linear"')
-        rows = Rows(
-            inertial.stamps_ns,
-            inertial.angular_velocity @ body_R_imu.T,
-            force - bias[3:],
-            samples.stamps_ns,
-            velocity,
-            cov,
-            samples.stamps_ns,
-            False,
-            UNTURNED,
-        )
+        rate, at_ns = inertial.angular_velocity @ body_R_imu.T, samples.stamps_ns
+        rows = Rows(inertial.stamps_ns, rate, force - bias[3:], at_ns, velocity, cov, at_ns, False, UNTURNED)
         with np.errstate(over="ignore", invalid="ignore"):
             R, (v, p, s), P, D, first, last = self._integrated(rows, bias[:3], earth, arm)
         if not isfinite(sum(s.tolist()) + P.item(9, 9) + P.item(10, 10) + P.item(11, 11)):
@@ -458,5 +402,11 @@ def imu_rows_around(imu: Imu, start_ns: int, end_ns: int, longest_hole_s: float)
             f" {end_ns} ns; begin and end at Doppler samples within them"
         )
     require_distinct_stamps("Imu", imu.stamps_ns, first, last)
-    refuse_holes(longest_hole_s, imu.stamps_ns, first, last)
+    row, imu_ns = row_after_hole(imu.stamps_ns, first, last, round(longest_hole_s * 1e9)), imu.stamps_ns
+    if row >= 0:
+        raise MeasurementError(
+            f"Imu.stamps_ns: no row for {(imu_ns[row] - imu_ns[row - 1]) * 1e-9:.3g} s after {imu_ns[row - 1]} ns: the"
+            " turn in there is not measured; begin a motion after it, let sonar_graph.navigation.odometry.Odometry"
+            f" bridge it, or set longest_hole_s ({longest_hole_s:g} s) higher if the vehicle hardly turns"
+        )
     return imu.rows(slice(first, last + 1))

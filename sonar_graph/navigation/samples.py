@@ -19,10 +19,7 @@ samples of 5 mm/s at 7 Hz, short enough for an accelerometer's bias not to have 
 
 
 class StampedRows:
-    """Rows of one sensor in the order of their stamps, each stamp once, with columns of values.
-
-    ``values``: the columns, empty.
-    """
+    """Rows of one sensor in the order of their stamps, each stamp once, with columns of values, given empty."""
 
     def __init__(self, *values: NDArray[Any]) -> None:
         self._show(0, np.empty(0, np.int64), *values)

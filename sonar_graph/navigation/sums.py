@@ -16,17 +16,13 @@ docs/theory/preintegration.md.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.motion import Motions
-from sonar_graph.navigation.steps import Rows, Step, has_gap, in_hole, may_be_in_hole, put, row, rows_until, step_from
+from sonar_graph.navigation.steps import Rows, has_gap, hole_from, put, row, rows_until, step_from
 from sonar_graph.numerics import (
     I3,
-    ZERO,
-    Mat3,
     Mat6,
     Vec3,
     block,
@@ -34,7 +30,6 @@ from sonar_graph.numerics import (
     cross,
     diagonal,
     exp_and_mean,
-    inlined,
     inverse_adjoint,
     skew,
     store,
@@ -76,116 +71,62 @@ def motions_over(
     return Motions(dR, dp, C.reshape(n, 6, 6), D.reshape(n, 6, 3), impulse)
 
 
-class Sums(NamedTuple):
-    """Sums of the steps so far: pose, impulse f, and the blocks of C_i and D_i, t rotation and r translation."""
-
-    R: Mat3
-    p: Vec3
-    f: Vec3
-    tt: Mat3
-    rt: Mat3
-    rr: Mat3
-    D_t: Mat3
-    D_r: Mat3
-
-
-@inlined
-def sums_of(sums: Floats, n: int, e: int) -> Sums:
-    """Sums of interval e of n."""
-    at, n3 = 5 * n + 3 * e, 3 * n
-    tt, rt, rr = block(sums, at, 0), block(sums, at + n3, 0), block(sums, at + 2 * n3, 0)
-    D_t, D_r = block(sums, at + 3 * n3, 0), block(sums, at + 4 * n3, 0)
-    return Sums(block(sums, 3 * e, 0), row(sums, 3 * n + e), row(sums, 4 * n + e), tt, rt, rr, D_t, D_r)
-
-
-@inlined
-def put_sums(each: Sums, sums: Floats, n: int, e: int) -> None:
-    """Write the sums of interval e of n."""
-    store(each.R, sums, 3 * e, 0)
-    put(each.p, sums, 3 * n + e)
-    put(each.f, sums, 4 * n + e)
-    store(each.tt, sums, 5 * n + 3 * e, 0)
-    store(each.rt, sums, 8 * n + 3 * e, 0)
-    store(each.rr, sums, 11 * n + 3 * e, 0)
-    store(each.D_t, sums, 14 * n + 3 * e, 0)
-    store(each.D_r, sums, 17 * n + 3 * e, 0)
-
-
-@inlined
-def with_step(each: Sums, step: Step, turn_psd: Vec3, bias: Vec3, earth: Vec3, arm: Vec3, gyro_psd: float) -> Sums:
-    """Sums with one more step, whose rates miss noise of a spectral density ``turn_psd`` besides the gyros' own."""
-    R, p, f, tt, rt, rr, D_t, D_r = each
-    dt, w, N = step.duration_s, step.rate - bias - R.T @ earth, gyro_psd * I3
-    turn, mean = exp_and_mean(dt * w)
-    R_k = R @ mean
-    if turn_psd @ turn_psd > 0.0:
-        N = N + R_k @ diagonal(turn_psd) @ R_k.T
-    s = dt * (R_k @ (step.velocity - cross(w, arm)))
-    c = skew(p + 0.5 * s + R_k @ arm)
-    rr_k = R_k @ step.Q @ R_k.T - c @ N @ c
-    return Sums(
-        R @ turn,
-        p + s,
-        f + dt * (R_k @ step.force),
-        tt + dt * N,
-        rt + dt * (c @ N),
-        rr + dt * rr_k,
-        D_t - dt * R_k,
-        D_r - dt * (c @ R_k),
-    )
-
-
-@compiled
-def _add_steps(
-    rows: Rows, imu_rows: int, dvl_rows: int, t: int, end: int, bias: Floats, earth: Floats, body_p_dvl: Floats,
-    gyro_psd: float, sums: Floats, n: int, e: int,
-) -> int:  # fmt: skip
-    """Add steps to the sums of interval e, up to its end or a hole of the IMU; returns the instant reached."""
-    b, E, arm, each = vec(bias), vec(earth), vec(body_p_dvl), sums_of(sums, n, e)
-    i, k = rows_until(rows.imu_ns, t), rows_until(rows.dvl_ns, t)
-    while t < end and not may_be_in_hole(rows, imu_rows, i, end):
-        step = step_from(rows, imu_rows, dvl_rows, i, k, t, end)
-        t = step.until_ns
-        i += int(i < imu_rows and rows.imu_ns[i] <= t)
-        k += int(k < dvl_rows and rows.dvl_ns[k] <= t)
-        each = with_step(each, step, ZERO, b, E, arm, gyro_psd)
-    put_sums(each, sums, n, e)
-    return t
-
-
-@compiled
-def _add_step_in_hole(
-    rows: Rows, imu_rows: int, dvl_rows: int, t: int, end: int, bias: Floats, earth: Floats, body_p_dvl: Floats,
-    gyro_psd: float, sums: Floats, n: int, e: int,
-) -> int:  # fmt: skip
-    """Add one step as `_add_steps`, where there may be a hole; apart from it, since calls make a loop slow."""
-    i, k = rows_until(rows.imu_ns, t), rows_until(rows.dvl_ns, t)
-    step, turn_psd = in_hole(rows, imu_rows, i, t, step_from(rows, imu_rows, dvl_rows, i, k, t, end))
-    noise = vec(bias), vec(earth), vec(body_p_dvl), gyro_psd
-    put_sums(with_step(sums_of(sums, n, e), step, turn_psd, *noise), sums, n, e)
-    return step.until_ns
-
-
 @compiled
 def _write_motions(
-    rows: Rows, start_ns: Ints, end_ns: Ints, known_ns: Ints, longest_ns: int, bias: Floats, earth: Floats,
-    body_p_dvl: Floats, gyro_density: float, sums: Floats, C: Floats, D: Floats,
-) -> None:  # fmt: skip
+    rows: Rows,
+    start_ns: Ints,
+    end_ns: Ints,
+    known_ns: Ints,
+    longest_ns: int,
+    bias: Floats,
+    earth: Floats,
+    body_p_dvl: Floats,
+    gyro_density: float,
+    sums: Floats,
+    C: Floats,
+    D: Floats,
+) -> None:
     """Continue sums, and fill C and D of `Motions`; matrices one below the other (reshaping is slow to compile)."""
-    n, noise = len(start_ns), (bias, earth, body_p_dvl, gyro_density**2)
+    n, b, E, arm, n2 = len(start_ns), vec(bias), vec(earth), vec(body_p_dvl), gyro_density**2 * I3
     for e in range(n):
         t, end = start_ns[e], end_ns[e]
+        i, k = rows_until(rows.imu_ns, t), rows_until(rows.dvl_ns, t)
         imu_rows, dvl_rows = rows_until(rows.imu_ns, known_ns[e]), max(rows_until(rows.known_ns, known_ns[e]), 1)
-        if has_gap(rows.dvl_ns, dvl_rows, rows_until(rows.dvl_ns, t), t, end, longest_ns):
-            t = end
-            store(np.nan * I3, sums, 3 * e, 0)
-            put(NOWHERE, sums, 3 * n + e)
-            put(NOWHERE, sums, 4 * n + e)
+        at = 5 * n + 3 * e
+        R, p, f = block(sums, 3 * e, 0), row(sums, 3 * n + e), row(sums, 4 * n + e)
+        tt, rt, rr = block(sums, at, 0), block(sums, at + 3 * n, 0), block(sums, at + 6 * n, 0)
+        D_t, D_r = block(sums, at + 9 * n, 0), block(sums, at + 12 * n, 0)
+        if has_gap(rows.dvl_ns, dvl_rows, k, t, end, longest_ns):
+            t, R, p, f = end, np.nan * I3, NOWHERE, NOWHERE
         while t < end:
-            t = _add_steps(rows, imu_rows, dvl_rows, t, end, *noise, sums, n, e)
-            if t < end:
-                t = _add_step_in_hole(rows, imu_rows, dvl_rows, t, end, *noise, sums, n, e)
-        R, p, _, tt, rt, rr, D_t, D_r = sums_of(sums, n, e)
+            until, turn_psd, unfelt = hole_from(rows, imu_rows, dvl_rows, i, k, t, end)
+            f += unfelt
+            while t < until:
+                t, dt, rate, v, Q, force = step_from(rows, imu_rows, dvl_rows, i, k, t, until)
+                i += int(i < imu_rows and rows.imu_ns[i] <= t)
+                k += int(k < dvl_rows and rows.dvl_ns[k] <= t)
+                w = rate - b - R.T @ E
+                turn, mean = exp_and_mean(dt * w)
+                R_k, N = R @ mean, n2
+                if turn_psd @ turn_psd > 0.0:
+                    N = n2 + R_k @ diagonal(turn_psd) @ R_k.T
+                s = dt * (R_k @ (v - cross(w, arm)))
+                c = p + 0.5 * s + R_k @ arm
+                cN = skew(c) @ N
+                tt += dt * N
+                rt += dt * cN
+                rr += dt * (R_k @ Q @ R_k.T - cN @ skew(c))
+                D_t, D_r = D_t - dt * R_k, D_r - dt * (skew(c) @ R_k)
+                f += dt * (R_k @ force)
+                p, R = p + s, R @ turn
+        store(R, sums, 3 * e, 0)
+        put(p, sums, 3 * n + e)
+        put(f, sums, 4 * n + e)
+        store(tt, sums, at, 0)
+        store(rt, sums, at + 3 * n, 0)
+        store(rr, sums, at + 6 * n, 0)
+        store(D_t, sums, at + 9 * n, 0)
+        store(D_r, sums, at + 12 * n, 0)
         to_j = inverse_adjoint(R, p)
         store6(to_j @ Mat6(tt, rt.T, rt, rr) @ to_j.T, C, 6 * e)
         store(to_j.a @ D_t, D, 6 * e, 0)
