@@ -91,8 +91,8 @@ class Frontend:
         is_open = [why is None or wait for why, wait in zip(refusals, waits, strict=True)]
         ids = frame.most_probable()[0].tolist()
         rows = [
-            self.journal.record(stamp_ns, i, Outcome.WAITING if is_seen or why is None else why)
-            for i, why, is_seen in zip(ids, refusals, is_open, strict=True)
+            self.journal.record(stamp_ns, landmark_id, why or Outcome.WAITING)
+            for landmark_id, why in zip(ids, refusals, strict=True)
         ]
         if not any(is_open):
             return None

@@ -24,6 +24,8 @@ from sonar_graph.calibration import (
 from sonar_graph.measurements import Depth, Dvl, Imu
 from sonar_graph.navigation import Odometry, PreintegratedMotion
 from sonar_graph.navigation.alignment.gravity import earth_rate_in_world
+from sonar_graph.simulation.basin import BasinOptions, simulate_basin
+from sonar_graph.slam import Isam2
 from sonar_graph.slam.keyframes import KeyframeParams, Keyframes, positive_definite, weights_at_end
 from tests.navigation.rows import NS, T0_NS, dvl, imu, stamps
 
@@ -414,3 +416,16 @@ def test_weights_are_those_of_least_squares_with_a_shared_random_walk(depths):
     weights, mean_variance = weights_at_end(variance, wander)
     assert weights == pytest.approx(expected, rel=1e-6, abs=1e-9)
     assert mean_variance == pytest.approx(1 / (ones @ np.linalg.solve(C, ones)), rel=1e-6)
+
+
+def test_motions_from_a_keyframe_are_for_the_bias_that_is_estimated_there():
+    """Right after it was set by time, when nothing else has moved the estimate since."""
+    sequence = simulate_basin(BasinOptions(duration_s=130.0, laps=1, seed=3))
+    estimator = Isam2(sequence.calibration, Odometry(sequence.calibration))
+    biases = []
+    for step in replace(sequence, detections=None).replay(sequence.instants(2.0)):
+        if estimator.process(step) is not None:
+            keyframes = estimator._keyframes
+            biases.append(keyframes.bias(len(keyframes.stamps_ns) - 1).tolist())
+            assert keyframes.motion_since_newest(step.end_ns).bias.tolist() == biases[-1]
+    assert len(set(map(tuple, biases))) > 3

@@ -160,13 +160,14 @@ SELDOM_HZ = 0.1
 def answers(policy: str, seed: int | None, source: type[Odometry] = Odometry) -> EstimatorRun:
     """At tens of seconds, of identities that are late, wrong and missing.
 
-    Calls every ten seconds, and asked only at the end; with a seed also calls 0.25 to 2 s apart, asked at every eighth.
+    Calls every ten seconds, and asked only at the end; with a seed also calls a quarter to two seconds apart, of which
+    every eighth asks. Calls at quarters of a second fall on epochs and frames too.
     """
     sequence = simulate_basin(BasinOptions(**BASIN, **TROUBLES["late and wrong"], anonymous_share=0.3))
     instants = tens = sequence.instants(SELDOM_HZ)
     if seed is not None:
-        apart_s = np.random.default_rng(seed).uniform(0.25, 2.0, 1000)
-        between = tens[0] + np.cumsum(np.round(apart_s * NS).astype(np.int64))
+        quarters = np.random.default_rng(seed).integers(1, 9, 1000)
+        between = tens[0] + np.cumsum(quarters) * NS // 4
         instants = np.union1d(tens, between[between < tens[-1]])
     made = laws.run(
         lambda calibration, _: Isam2(calibration, source(calibration), isam2_params(**CUT[policy])),

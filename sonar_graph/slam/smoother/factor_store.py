@@ -37,6 +37,8 @@ class FactorStore:
         """Number of factors."""
         self.new: dict[int, FactorGroup] = {}
         """Groups that the window has not taken up yet, by handle."""
+        self.new_graph = gtsam.NonlinearFactorGraph()
+        """Their factors."""
         self.gone: set[gtsam.NonlinearFactor] = set()
         """Factors that were taken out since the window took up the others."""
         self._groups: dict[int, FactorGroup] = {}
@@ -48,6 +50,8 @@ class FactorStore:
         handle, self._next = self._next, self._next + 1
         self._groups[handle] = self.new[handle] = group
         self.size += len(group.factors)
+        for factor in group:
+            self.new_graph.add(factor)
         if group.seen is not None:
             lasting = [group.seen[1].pose_key]
         else:
@@ -65,6 +69,7 @@ class FactorStore:
             group = self._groups.pop(handle)
             self.gone.update(group)
             self.size -= len(group.factors)
+        self.new_graph = graph_of(self.new.values())
 
     def leave(self, keys: Iterable[int]) -> None:
         """Give up the groups that leave with these variables."""
@@ -75,7 +80,7 @@ class FactorStore:
 
     def take_up(self) -> None:
         """The window has taken up what was new, and let go of what is gone."""
-        self.new, self.gone = {}, set()
+        self.new, self.gone, self.new_graph = {}, set(), gtsam.NonlinearFactorGraph()
 
     def factors(self, handles: Iterable[int]) -> list[gtsam.NonlinearFactor]:
         """Factors of some groups."""

@@ -28,7 +28,7 @@ from sonar_graph.slam.smoother.batch_solution import (
     marginals_of,
     solve_in_sight,
 )
-from sonar_graph.slam.smoother.factor_store import FactorGroup, Factors, FactorStore, graph_of
+from sonar_graph.slam.smoother.factor_store import FactorGroup, Factors, FactorStore
 from sonar_graph.slam.smoother.fixed_lag import SmootherWindow, picked, split, with_marginals
 from sonar_graph.slam.smoother.observability import Blame, Withheld, variable_name
 from sonar_graph.tagged_sections import tagged
@@ -143,7 +143,7 @@ class Smoother:
         if not self.is_bounded:
             return self._store.graph()
         graph = with_marginals(*self._taken_up, self._store.gone)
-        graph.push_back(graph_of(self._store.new.values()))
+        graph.push_back(self._store.new_graph)
         return graph
 
     def graph_without(self, handles: set[int]) -> gtsam.NonlinearFactorGraph:
@@ -231,7 +231,7 @@ class Smoother:
             self.add_landmark(key, point)
         handles = [self.add(group.factors, group.seen) for group in added]
         self._withhold_unusable()
-        keys = graph_of(self._store.new.values()).keyVector()
+        keys = self._store.new_graph.keyVector()
         self._window.lag_s = self._lag_at(time_s, keeps_all=self.is_bounded)
         if slots is None or lost_landmarks or len(self.in_window(keys)) < len(keys):
             self._kept_covariance.renew(self._landmarks)
@@ -282,7 +282,7 @@ class Smoother:
             if leaving := {key for key in old if not self._new_values.exists(key)}:
                 self._departures.leave(leaving, self.values, self.marginals)
         self._window.lag_s = lag_s
-        graph, times = graph_of(self._store.new.values()), self._times(self._new_times_s, time_s)
+        graph, times = self._store.new_graph, self._times(self._new_times_s, time_s)
         try:
             estimate = self._window.update(graph, self._new_values, times, removed_slots)
         except RuntimeError:
@@ -341,7 +341,7 @@ class Smoother:
         self._withhold(found)
         for key in set().union(*(withheld.keys for withheld in found)):
             theta.erase(key)
-        before.push_back(graph_of(self._store.new.values()))
+        before.push_back(self._store.new_graph)
         kept_s = {key: self._expiring.get(key, time_s) for key in list(theta.keys())}
         try:
             self._window.begin(before, theta, self._times(kept_s, time_s))

@@ -18,7 +18,7 @@ import numpy as np
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats
 from sonar_graph.slam.smoother.batch_solution import tangent_size
-from sonar_graph.slam.smoother.factor_store import FactorStore, graph_of
+from sonar_graph.slam.smoother.factor_store import FactorStore
 
 Labelled = tuple[str, gtsam.NonlinearFactor]
 MARGINAL = "marginal of what left the window"
@@ -139,7 +139,7 @@ class Blame:
 
     def __init__(self, store: FactorStore, new_keys: Collection[int], times_s: Mapping[int, float]) -> None:
         self._store, self._new_keys, self._times_s = store, new_keys, times_s
-        self.graph = graph_of(store.new.values())
+        self.graph = store.new_graph
         """New factors."""
 
     def spoilt(self, values: gtsam.Values) -> list[Withheld]:
