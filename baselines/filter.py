@@ -29,7 +29,7 @@ from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats, Ints, LandmarkDetections, Measurements
 from sonar_graph.motion import Motions, MotionSource, require_source
 from sonar_graph.navigation.alignment import earth_rate_in_world, tilt_sigma, up_direction
-from sonar_graph.numerics import block, compiled, cross, exp_and_mean, mat, store, vec
+from sonar_graph.numerics import compiled, cross, exp_and_mean, mat, store, vec
 from sonar_graph.slam.landmarks import gate_threshold, identify
 from sonar_graph.slam.models import elevation_on_floor
 from sonar_graph.states import (
@@ -74,7 +74,7 @@ def corrected(
     """
     dR, dp = mat(dR_), vec(dp_)
     rate = vec(bias) + 0.5 * (vec(earth) + dR.T @ vec(earth))
-    theta, rho = block(D, 0, 0) @ rate, block(D, 3, 0) @ rate
+    theta, rho = mat(D) @ rate, mat(D, 3, 0) @ rate
     turned, moved, pushed = np.empty((3, 3)), np.empty(3), np.empty(3)
     store(dR @ exp_and_mean(theta)[0], turned, 0, 0)
     moved[0], moved[1], moved[2] = dp + dR @ rho
@@ -459,15 +459,15 @@ class FilterShell(ABC):
         if detections is None:
             return NO_STAMPS, NO_VIEWS
         n, stamps_ns = len(detections), detections.stamps_ns
-        identities = identify(detections, self._minimum_id_probability)
-        outcome = np.array([OPEN if why is None else OUTCOME_NUMBERS[why] for why in identities.refusals], np.int8)
+        ids, refusals = identify(detections, self._minimum_id_probability)
+        outcome = np.array([OPEN if why is None else OUTCOME_NUMBERS[why] for why in refusals], np.int8)
         if stamps_ns[0] < since_ns:
             outcome[stamps_ns < since_ns] = OUTCOME_NUMBERS[Outcome.LATE]
             outcome[stamps_ns < self._reached_ns] = OUTCOME_NUMBERS[Outcome.UNLOCATED]
-        landmark = np.array([-1 if self._was_lost else self._slots.get(i, -1) for i in identities.ids.tolist()])
+        landmark = np.array([-1 if self._was_lost else self._slots.get(i, -1) for i in ids.tolist()])
         z, e, S = np.empty((n, 2)), np.full((n, 2), math.nan), np.full((n, 2, 2), math.nan)
         z[:, 0], z[:, 1] = detections.range_m, detections.azimuth_rad
-        return identities.ids, Views(stamps_ns, landmark, z, self.sonar.noise_of(detections), outcome, e, S)
+        return ids, Views(stamps_ns, landmark, z, self.sonar.noise_of(detections), outcome, e, S)
 
     def _use(self, measurements: Measurements, since_ns: int, ids: Ints, views: Views) -> Estimate:
         """Carry the state to the newest epoch reached at the end of the call, with all measurements on the way."""
@@ -550,7 +550,7 @@ class FilterShell(ABC):
         velocity_j, variance_j = self.odometry.velocity_at_imu(epoch_ns)
         up = up_direction(self.impulse / duration_s, self.turned, velocity_i, velocity_j, duration_s)
         velocity_sigma = math.sqrt(0.5 * (variance_i + variance_j))
-        sigma = tilt_sigma(duration_s, velocity_sigma, self.calibration.imu, self.calibration.gravity_m_s2)
+        sigma = tilt_sigma(duration_s, velocity_sigma, self.calibration)
         if math.isfinite(up[0]):
             self.correct_up(up, sigma)
         self._opened_ns, self._opened_velocity = epoch_ns, (velocity_j, variance_j)

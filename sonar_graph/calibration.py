@@ -4,8 +4,6 @@ A `Calibration` travels inside the log (a metadata record) or comes from a TOML 
 in its name or docstring. Every estimator gets the same one.
 """
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 import gtsam
@@ -13,13 +11,10 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 STANDARD_GRAVITY = 9.80665
-HOLE_INTERVALS = 5
-"""Typical intervals of the IMU without a sample, above which there is a hole: one lost sample does no harm."""
-SHORTEST_HOLE_S = 0.05
-ROWS_BEFORE = 8
-"""Number of preceding intervals that define the typical one."""
-UNTYPICAL_S = 1.0
-"""Longest interval after the very first sample that is no hole."""
+HOLE_INTERVALS, SHORTEST_HOLE_S = 5, 0.05
+"""Typical intervals and seconds of the IMU without a sample; a hole exceeds both: one lost sample does no harm."""
+ROWS_BEFORE, UNTYPICAL_S = 8, 1.0
+"""Preceding intervals that define the typical one; longest interval after the very first sample that is no hole."""
 
 
 def within(lowest: float, highest: float, expected: str) -> AfterValidator:
@@ -37,9 +32,11 @@ Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 NotNegative = Annotated[Number, Field(ge=0)]
 Positive = Annotated[Number, Field(gt=0)]
 Angle = Annotated[Number, within(-2 * np.pi, 2 * np.pi, "radians between -2π and 2π (45° are 0.785)")]
+Angles = tuple[Angle, Angle, Angle]
+Latitude = Annotated[Number, within(-np.pi / 2, np.pi / 2, "radians between -π/2 and π/2 (48° are 0.838)")]
+Gravity = Annotated[Number, within(9, 10.5, "m/s² between 9 and 10.5 (9.76 to 9.84 on Earth)")]
 Vector = tuple[Number, Number, Number]
 Sigmas = tuple[NotNegative, NotNegative, NotNegative]
-Angles = tuple[Angle, Angle, Angle]
 
 
 class Section(BaseModel):
@@ -75,8 +72,7 @@ class ImuCalibration(Section):
     accel_bias_sigma: NotNegative = 1e-2
     """Bias of specific force, m/s²."""
     turn_sigma_rad_s: Sigmas = (0.05, 0.05, 0.15)
-    """Standard deviation of the vehicle's angular rate about each axis of the body, used in IMU holes; 0: a hole is
-    treated as any other interval."""
+    """Standard deviation of the vehicle's rate about each body axis, in IMU holes; 0: holes count as measured."""
     turn_time_s: tuple[Positive, Positive, Positive] = (0.5, 0.5, 1.5)
     """Time constant of these rates: their sigma over the standard deviation of angular acceleration."""
     mounting: Mounting = Mounting()
@@ -85,14 +81,13 @@ class ImuCalibration(Section):
 class DvlCalibration(Section):
     """Doppler velocity log."""
 
-    velocity_sigma_m_s: tuple[NotNegative, NotNegative, NotNegative] = (0.01, 0.01, 0.01)
+    velocity_sigma_m_s: Sigmas = (0.01, 0.01, 0.01)
     """White noise of one velocity sample along each axis of the DVL, where the log has no covariance."""
     mounting: Mounting = Mounting()
     gap_s: Positive = 1.5
     """Time without a sample above which there is a DVL gap, bridged by accelerometers."""
     velocity_walk_density: Positive = 0.1
-    """Random walk of the vehicle's velocity, m/s/√s: for DVL gaps without accelerometers, and for the gate of
-    outliers."""
+    """Random walk of the vehicle's velocity, m/s/√s: for DVL gaps without accelerometers and the gate of outliers."""
 
 
 class DepthCalibration(Section):
@@ -186,10 +181,6 @@ class Calibration(Section):
     odometry_interpolation: Literal["linear", "hold-past"] = "linear"
     """Meaning of velocity and rate samples. ``linear``: values at their stamps, linear in between (Doppler logs,
     gyros); ``hold-past``: means over the interval that ends at the stamp (wheel odometry given as displacements)."""
-    gravity_m_s2: Annotated[Number, within(9, 10.5, "m/s² between 9 and 10.5 (9.76 to 9.84 on Earth)")] = (
-        STANDARD_GRAVITY
-    )
-    earth_rate_latitude_rad: (
-        Annotated[Number, within(-np.pi / 2, np.pi / 2, "radians between -π/2 and π/2 (48° are 0.838)")] | None
-    ) = None
+    gravity_m_s2: Gravity = STANDARD_GRAVITY
+    earth_rate_latitude_rad: Latitude | None = None
     """Latitude for removing the Earth's rotation from the gyros (world x east, y north); None: not removed."""

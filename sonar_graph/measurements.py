@@ -1,95 +1,81 @@
 """Measurements as columnar blocks of n >= 1 rows, one class for each kind of sensor.
 
 A live caller passes blocks of one row, a replay passes all rows between two instants: the same code, without a
-Python call for every IMU sample. Rows are sorted by stamp. `Measurements` bundles the blocks that arrived since the
-last call; that is what an estimator processes.
+Python call for every IMU sample. `Measurements` bundles what arrived since the last call, for an estimator to process.
 """
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
-from typing import Any, ClassVar, Self
+from dataclasses import dataclass, field, fields
+from itertools import pairwise
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sonar_graph.errors import MeasurementError
 
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 NS_PER_S = 1_000_000_000
-"""Stamps are whole nanoseconds."""
+NO_TRACK = -1
+"""Track number of a detection that belongs to no track."""
 ROUNDING = 1e-6
 """Tolerance of a sum of posteriors above 1: single precision."""
 FIRST_TOO_LARGE_ID = 2**56
 """An identity is part of a variable's key in a graph, which has 56 bits for it."""
+ID_ADVICE = "number the landmarks from 0 on, such as 1, 2, 3, where identities are made (a hash has no place)"
 FARTHEST_M = 100_000.0
 """Largest range accepted; no sonar sees farther."""
-ID_ADVICE = "number the landmarks from 0 on, such as 1, 2, 3, where identities are made (a hash has no place)"
 
 
-def no_posterior(probability: NDArray[np.float64]) -> NDArray[np.bool_]:
+def no_posterior(probability: Floats) -> NDArray[np.bool_]:
     """Mask, shape (n,), of rows of ``probability``, shape (n, k), that are below 0, NaN, or above 1 in sum."""
     with np.errstate(invalid="ignore", over="ignore"):
         is_one = (probability >= 0).all(axis=1) & (probability.sum(axis=1) <= 1.0 + ROUNDING)
     return np.asarray(~is_one)
 
 
-def too_large(ids: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Mask, shape (n,), of rows of ``ids``, shape (n, k), with an identity of 2^56 or more."""
-    return np.asarray((ids >= FIRST_TOO_LARGE_ID).any(axis=1))
-
-
-def possible_ranges(range_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+def possible_ranges(range_m: Floats) -> NDArray[np.bool_]:
     """Mask of ranges above 0 and at most `FARTHEST_M`, shape (n,)."""
     return np.asarray((range_m > 0) & (range_m <= FARTHEST_M))
 
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-NO_TRACK = -1
-"""Track number of a detection that belongs to no track."""
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Block:
-    """Base class of the measurements: rows with a stamp each.
+    """Base class of the measurements: columns, arrays whose first axis runs over the rows, with a stamp each.
 
-    Every field is an array whose first axis runs over the rows. The constructor converts types where needed (without a
-    copy where not) and checks shapes, finiteness and the order of stamps.
+    The constructor converts types where needed (without a copy where not). A column says in its metadata the ``shape``
+    of one row, where that is fixed, and whether it must be ``finite``; elsewhere NaN means "not measured".
 
-    Raises `MeasurementError` when there is no row, a column has another shape than it says, a number that must be
-    finite is not, or stamps are no integers or run backwards.
+    Raises `MeasurementError` when there is no row, a column has another shape or type than it says, a number that must
+    be finite is not, or stamps are no integers or run backwards.
     """
 
     stamps_ns: Ints
     """Time of validity, shape (n,), integer nanoseconds, not decreasing."""
-    finite_columns: ClassVar[tuple[str, ...]] = ()
-    """Columns in which NaN is refused; in others it means "not measured"."""
-    row_shapes: ClassVar[dict[str, tuple[int, ...]]] = {}
-    """Shape of one row of each column with a fixed row shape."""
 
     def __post_init__(self) -> None:
-        name = type(self).__name__
-        object.__setattr__(self, "stamps_ns", _in_nanoseconds(name, np.asarray(self.stamps_ns)))
-        n = len(self.stamps_ns)
-        for field in fields(self)[1:]:
-            column, is_whole = field.name, str(field.type) == "Ints"
-            values = _numbers(f"{name}.{column}", np.asarray(getattr(self, column)), is_whole=is_whole)
-            row_shape = self.row_shapes.get(column, values.shape[1:])
-            if values.shape[:1] == (n,) and values.shape[1:] != row_shape:
-                raise MeasurementError(f"{name}.{column}: expected shape {(n, *row_shape)}, not {values.shape}")
-            if values.shape != (n, *row_shape):
+        name, stamps = type(self).__name__, np.asarray(self.stamps_ns)
+        if stamps.size == 0:
+            raise MeasurementError(f"{name}: a block needs at least one row; leave the block out instead")
+        if stamps.ndim != 1:
+            raise MeasurementError(f"{name}.stamps_ns: expected shape (n,), not {stamps.shape}")
+        n = len(stamps)
+        for column in fields(self):
+            place = f"{name}.{column.name}"
+            values = _numbers(place, np.asarray(getattr(self, column.name)), is_whole=column.type == "Ints")
+            row_shape = column.metadata.get("shape", values.shape[1:])
+            if values.shape[:1] != (n,):
                 advice = "; transpose it" * (values.shape[1:] == (n,))
-                raise MeasurementError(
-                    f"{name}.{column}: shape {values.shape} has not one row for each of {n} stamps{advice}"
-                )
-            object.__setattr__(self, column, values)
-        for finite in self.finite_columns:
-            whole = np.isfinite(getattr(self, finite).reshape(n, -1)).all(axis=1)
-            if not whole.all():
-                row = int(np.argmin(whole))
-                raise MeasurementError(f"{name}.{finite}: row {row} is not finite; leave such rows out of the block")
+                raise MeasurementError(f"{place}: shape {values.shape} has not one row for each of {n} stamps{advice}")
+            if values.shape[1:] != row_shape:
+                raise MeasurementError(f"{place}: expected shape {(n, *row_shape)}, not {values.shape}")
+            if column.metadata.get("finite") and not np.isfinite(values).all():
+                row = np.argwhere(~np.isfinite(values))[0, 0]
+                raise MeasurementError(f"{place}: row {row} is not finite; leave such rows out of the block")
+            object.__setattr__(self, column.name, values)
         backwards = np.flatnonzero(self.stamps_ns[1:] < self.stamps_ns[:-1])
         if backwards.size:
             raise MeasurementError(f"{name}: stamps run backwards after row {backwards[0]}; sort the rows by stamp")
@@ -107,7 +93,7 @@ class Block:
             for name, column in vars(self).items():
                 object.__setattr__(block, name, column[selection])
             return block
-        return type(self)(*(getattr(self, field.name)[selection] for field in fields(self)))
+        return type(self)(*(getattr(self, column.name)[selection] for column in fields(self)))
 
     def between(self, after_ns: int, until_ns: int) -> Self | None:
         """The rows with ``after_ns < stamp <= until_ns``, or None where there is none."""
@@ -117,31 +103,18 @@ class Block:
     @classmethod
     def concatenate(cls, blocks: Sequence[Self]) -> Self:
         """One block from several, in the order given."""
-        return cls(*(np.concatenate([getattr(b, field.name) for b in blocks]) for field in fields(cls)))
+        return cls(*(np.concatenate([getattr(b, column.name) for b in blocks]) for column in fields(cls)))
 
 
 def _numbers(place: str, values: NDArray[Any], *, is_whole: bool) -> NDArray[Any]:
     """Column as int64 or float64; refuses floats where integers are expected, instead of truncating them."""
     kinds, expected = ("iu", "integers") if is_whole else ("iufb", "numbers")
     if values.dtype.kind not in kinds and values.size:
-        raise MeasurementError(f"{place}: expected {expected}, not {values.dtype}")
-    if is_whole and values.dtype.kind == "u" and values.size and int(values.max()) > np.iinfo(np.int64).max:
+        advice = "; of seconds: np.round(seconds * 1e9).astype(np.int64)" * place.endswith(".stamps_ns")
+        raise MeasurementError(f"{place}: expected {expected}, not {values.dtype}{advice}")
+    if values.dtype.kind == "u" and is_whole and values.size and int(values.max()) > np.iinfo(np.int64).max:
         raise MeasurementError(f"{place}: expected integers below 2^63, not {values.max()}")
     return values.astype(np.int64 if is_whole else np.float64, copy=False)
-
-
-def _in_nanoseconds(name: str, stamps: NDArray[Any]) -> Ints:
-    """Stamps as int64; refuses floats, which would be seconds."""
-    if stamps.size == 0:
-        raise MeasurementError(f"{name}: a block needs at least one row; leave the block out instead")
-    if stamps.dtype.kind not in "iu":
-        raise MeasurementError(
-            f"{name}.stamps_ns: expected integer nanoseconds, not {stamps.dtype}; of seconds:"
-            " np.round(seconds * 1e9).astype(np.int64)"
-        )
-    if stamps.ndim != 1:
-        raise MeasurementError(f"{name}.stamps_ns: expected shape (n,), not {stamps.shape}")
-    return stamps.astype(np.int64, copy=False)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -153,20 +126,15 @@ class Imu(Block):
     Two samples of a vehicle at rest, 10 ms apart:
 
     >>> import numpy as np
-    >>> imu = Imu(
-    ...     stamps_ns=np.array([0, 10_000_000]),
-    ...     angular_velocity=np.zeros((2, 3)),
-    ...     specific_force=np.tile([0.0, 0.0, 9.81], (2, 1)),
-    ... )
+    >>> force = np.array([[0.0, 0.0, 9.81], [0.0, 0.0, 9.81]])
+    >>> imu = Imu(stamps_ns=np.array([0, 10_000_000]), angular_velocity=np.zeros((2, 3)), specific_force=force)
     >>> len(imu)
     2
     """
 
-    angular_velocity: Floats
+    angular_velocity: Floats = field(metadata={"shape": (3,), "finite": True})
     """Shape (n, 3), rad/s."""
-    finite_columns = ("angular_velocity",)
-    row_shapes: ClassVar[dict[str, tuple[int, ...]]] = {"angular_velocity": (3,), "specific_force": (3,)}
-    specific_force: Floats
+    specific_force: Floats = field(metadata={"shape": (3,)})
     """Acceleration minus gravity, shape (n, 3), m/s²: +9.81 on z at rest; NaN: not measured."""
 
 
@@ -177,20 +145,15 @@ class Dvl(Block):
     Examples
     --------
     >>> import numpy as np
-    >>> dvl = Dvl(
-    ...     stamps_ns=np.array([0, 200_000_000]),
-    ...     velocity=np.array([[0.15, 0.0, 0.0], [0.16, 0.0, 0.0]]),
-    ...     velocity_cov=np.full((2, 3, 3), np.nan),
-    ... )
+    >>> velocity, unknown = np.array([[0.15, 0.0, 0.0], [0.16, 0.0, 0.0]]), np.full((2, 3, 3), np.nan)
+    >>> dvl = Dvl(stamps_ns=np.array([0, 200_000_000]), velocity=velocity, velocity_cov=unknown)
     >>> dvl.between(0, 200_000_000).velocity
     array([[0.16, 0.  , 0.  ]])
     """
 
-    velocity: Floats
+    velocity: Floats = field(metadata={"shape": (3,), "finite": True})
     """Shape (n, 3), m/s."""
-    finite_columns = ("velocity",)
-    row_shapes: ClassVar[dict[str, tuple[int, ...]]] = {"velocity": (3,), "velocity_cov": (3, 3)}
-    velocity_cov: Floats
+    velocity_cov: Floats = field(metadata={"shape": (3, 3)})
     """Shape (n, 3, 3), m²/s²; NaN where unknown: the calibration's value then holds."""
 
 
@@ -206,11 +169,9 @@ class Depth(Block):
     array([-0.5])
     """
 
-    z_m: Floats
+    z_m: Floats = field(metadata={"shape": (), "finite": True})
     """World z of the port (negative below the surface of a world with its origin there), shape (n,)."""
-    finite_columns = ("z_m",)
-    row_shapes: ClassVar[dict[str, tuple[int, ...]]] = {"z_m": (), "variance_m2": ()}
-    variance_m2: Floats
+    variance_m2: Floats = field(metadata={"shape": ()})
     """Shape (n,); NaN where unknown: the calibration's value then holds."""
 
 
@@ -224,34 +185,28 @@ class LandmarkDetections(Block):
 
     >>> import numpy as np
     >>> detections = LandmarkDetections(
-    ...     stamps_ns=np.array([0]),
-    ...     range_m=np.array([2.0]),
-    ...     azimuth_rad=np.array([np.deg2rad(10.0)]),
+    ...     stamps_ns=np.array([0]), range_m=np.array([2.0]), azimuth_rad=np.array([np.deg2rad(10.0)]),
     ...     range_azimuth_cov=np.diag([0.02**2, 0.009**2])[None],
-    ...     candidate_ids=np.array([[3, 4]]),
-    ...     id_probability=np.array([[0.95, 0.04]]),
+    ...     candidate_ids=np.array([[3, 4]]), id_probability=np.array([[0.95, 0.04]]),
     ... )
     >>> detections.most_probable()
     (array([3]), array([0.95]))
     """
 
-    range_m: Floats
+    range_m: Floats = field(metadata={"shape": (), "finite": True})
     """Slant range, shape (n,)."""
-    azimuth_rad: Floats
+    azimuth_rad: Floats = field(metadata={"shape": (), "finite": True})
     """``atan2(q_y, q_x)`` in the sonar frame, positive to the left, shape (n,)."""
-    finite_columns = ("range_m", "azimuth_rad")
-    row_shapes: ClassVar[dict[str, tuple[int, ...]]] = {"range_m": (), "azimuth_rad": (), "range_azimuth_cov": (2, 2)}
-    range_azimuth_cov: Floats
+    range_azimuth_cov: Floats = field(metadata={"shape": (2, 2)})
     """Covariance of (range, azimuth), shape (n, 2, 2); NaN where unknown: the calibration's value then holds."""
     candidate_ids: Ints
     """Identities that the recogniser considers, shape (n, k); -1 fills unused places."""
     id_probability: Floats
     """Posterior of each candidate, shape (n, k), in sum at most 1; the rest is "none of the known landmarks"."""
-    track: Ints = dataclasses.field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    """Track of each row, shape (n,); `NO_TRACK` (-1) or left out: no track.
+    track: Ints = field(default_factory=lambda: np.empty(0, dtype=np.int64), metadata={"shape": ()})
+    """Track of each row, shape (n,), whose rows show one object; `NO_TRACK` (-1) or left out: no track.
 
-    Rows of one track show the same object. Each row has the posterior given all evidence of the track so far, so the
-    last row's is the best."""
+    Each row has the posterior given all evidence of the track so far, so the last row's is the best."""
 
     def __post_init__(self) -> None:
         if not len(self.track):
@@ -264,29 +219,26 @@ class LandmarkDetections(Block):
                     f"LandmarkDetections.{column}: expected shape (n, k), k >= 1 identities of each row with their"
                     f" probabilities, not {shape}"
                 )
-        self._refuse("candidate_ids", too_large(self.candidate_ids), f"an identity of 2^56 or more; {ID_ADVICE}")
-        refused = "probabilities that are not between 0 and 1, or more than 1 in sum; 97 % is 0.97"
-        self._refuse("id_probability", no_posterior(self.id_probability), refused)
-
-    def _refuse(self, column: str, has_it: NDArray[np.bool_], fault: str) -> None:
-        if has_it.any():
-            row = int(np.argmax(has_it))
-            values = getattr(self, column)[row].tolist()
-            raise MeasurementError(f"LandmarkDetections.{column}: row {row} ({values}) has {fault}")
+        too_large = (self.candidate_ids >= FIRST_TOO_LARGE_ID).any(axis=1)
+        improper = "probabilities that are not between 0 and 1, or more than 1 in sum; 97 % is 0.97"
+        for column, has_it, fault in (
+            ("candidate_ids", too_large, f"an identity of 2^56 or more; {ID_ADVICE}"),
+            ("id_probability", no_posterior(self.id_probability), improper),
+        ):
+            if has_it.any():
+                row = int(has_it.argmax())
+                values = getattr(self, column)[row].tolist()
+                raise MeasurementError(f"LandmarkDetections.{column}: row {row} ({values}) has {fault}")
 
     def frames(self) -> Iterator[LandmarkDetections]:
         """Rows of each sonar frame, that is of each stamp."""
-        if self.stamps_ns[0] == self.stamps_ns[-1]:
-            yield self
-            return
-        ends = np.append(np.flatnonzero(np.diff(self.stamps_ns)) + 1, len(self)).tolist()
-        for first, last in zip([0, *ends[:-1]], ends, strict=True):
+        edges = [0, *(np.flatnonzero(np.diff(self.stamps_ns)) + 1).tolist(), len(self)]
+        for first, last in pairwise(edges):
             yield self.rows(slice(first, last))
 
     def most_probable(self) -> tuple[Ints, Floats]:
         """Identity with the highest posterior, and that posterior, shapes (n,) and (n,)."""
-        best = self.id_probability.argmax(axis=1)
-        row = np.arange(len(self))
+        row, best = np.arange(len(self)), self.id_probability.argmax(axis=1)
         return self.candidate_ids[row, best], self.id_probability[row, best]
 
 

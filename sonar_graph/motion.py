@@ -25,14 +25,13 @@ from sonar_graph.states import RefusedRow
 
 @dataclass(frozen=True, eq=False)
 class PreintegratedMotion:
-    """Motion from body frame i to body frame j, with its covariance and its derivative by the gyro bias.
+    """Motion from body frame i to body frame j.
 
     Examples
     --------
     A second at 0.5 m/s, and the same again, as one motion:
 
-    >>> import gtsam
-    >>> import numpy as np
+    >>> import gtsam, numpy as np
     >>> still, second = np.zeros(3), gtsam.Pose3(gtsam.Rot3(), np.array([0.5, 0.0, 0.0]))
     >>> motion = PreintegratedMotion(second, 1e-4 * np.eye(6), np.zeros((6, 3)), still, 1.0, np.array([0.0, 0.0, 9.81]))
     >>> twice = motion.then(motion)
@@ -43,9 +42,9 @@ class PreintegratedMotion:
     i_T_j: gtsam.Pose3
     """Mean, for the gyro bias `bias`."""
     covariance: Floats
-    """Covariance of the perturbation [rotation, translation] in frame j, shape (6, 6)."""
+    """C, covariance of [theta, rho], shape (6, 6), rad and m."""
     D_bias: Floats
-    """Derivative of the same perturbation by the gyro bias, shape (6, 3), per rad/s."""
+    """D, derivative of [theta, rho] by the gyro bias, shape (6, 3), per rad/s."""
     bias: Floats
     """Gyro bias that was removed, shape (3,), rad/s."""
     duration_s: float
@@ -76,10 +75,7 @@ class PreintegratedMotion:
 
 
 def require_source(odometry: object, calibration: Calibration, call: str) -> None:
-    """Raise a TypeError that names the ``call`` where an argument is no source of motion.
-
-    Also a `CalibrationError` where it says that it was made with another calibration than the estimator.
-    """
+    """Refuse what is no source of motion (TypeError), or was made with another calibration (CalibrationError)."""
     if isinstance(odometry, type) or not hasattr(odometry, "motions"):
         given = odometry.__name__ if isinstance(odometry, type) else type(odometry).__name__
         raise TypeError(f"{call}: expected a source of motion, such as Odometry(calibration), not {given}")
@@ -111,60 +107,43 @@ class MotionSource(Protocol):
     @property
     def refused(self) -> list[RefusedRow]:
         """Rows that are not used, with the reason."""
-        ...
 
     def add(self, imu: Imu | None, dvl: Dvl | None) -> bool:
         """Take in rows; True where some were placed before others: provisional motions are out of date."""
-        ...
 
     def start_by(self, until_ns: int) -> int | None:
         """First epoch, if it is reached at an instant; else None."""
-        ...
 
     def epochs(self, after_ns: int, until_ns: int) -> Ints:
         """Epochs after one instant that are reached at another, in order, shape (n,)."""
-        ...
 
     def reached_ns(self, epochs_ns: Ints) -> Ints:
         """Instants at which epochs are reached: an IMU row covers them, and their velocities are known; shape (n,)."""
-        ...
 
     def is_gap(self, start_ns: int, end_ns: int) -> bool:
         """True for a time without Doppler rows that is too long for a linear velocity."""
-        ...
 
     def motion(
         self, start_ns: int, end_ns: int, bias: Floats, world_R_i: Floats | None = None, known_ns: int | None = None
     ) -> PreintegratedMotion:
-        """Motion from one instant to another, over gaps too, from rows stamped no later than an instant.
+        """Motion from one instant to another, over gaps too, without the gyro bias (body axes, shape (3,), rad/s).
 
-        Parameters
-        ----------
-        bias
-            Gyro bias in body axes to remove, shape (3,), rad/s.
-        world_R_i
-            Attitude at the start, shape (3, 3), to remove the Earth's rotation where the calibration says so; None:
-            it is not removed.
-        known_ns
-            Rows stamped later are not used; None: ``end_ns``, or the instant at which it is reached if it is an epoch.
+        The attitude ``world_R_i`` at the start, shape (3, 3), serves to remove the Earth's rotation where the
+        calibration says so; None: it is not removed. Rows stamped after ``known_ns`` are not used; None: ``end_ns``, or
+        the instant at which it is reached if it is an epoch.
         """
-        ...
 
     def motions(self, start_ns: Ints, end_ns: Ints, known_ns: Ints, bias: Floats) -> Motions:
-        """Motions over intervals, each from rows stamped no later than its ``known_ns``; the Earth's turn is left in.
+        """Motions over n intervals, each from rows stamped no later than its ``known_ns``, for one ``bias`` (3,).
 
-        All of shape (n,); ``bias`` (3,). Many at once, for filters: intervals with a gap are left to `motion`.
+        Intervals with a gap are left to `motion`; the Earth's rotation is not removed.
         """
-        ...
 
     def velocity_at_imu(self, epoch_ns: int) -> tuple[Floats, float]:
         """Velocity of the IMU's point at an epoch, body axes, shape (3,), m/s, and the variance of one component."""
-        ...
 
     def settle(self, epoch_ns: int) -> None:
         """Declare the motion up to an epoch as used: rows stamped at or before it are late from now on."""
-        ...
 
     def forget_before(self, epoch_ns: int) -> None:
         """Settle, and drop rows that no motion from this epoch on can need."""
-        ...

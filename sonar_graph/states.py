@@ -6,7 +6,7 @@ import math
 import reprlib
 from array import array
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import StrEnum
 from functools import cached_property
 from typing import NamedTuple
@@ -50,11 +50,8 @@ class Trajectory:
     Two seconds of straight motion, and the pose in the middle:
 
     >>> import numpy as np
-    >>> path = Trajectory.without_covariances(
-    ...     stamps_ns=np.array([0, 2_000_000_000]),
-    ...     positions=np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]),
-    ...     quaternions_xyzw=np.array([[0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 1.0]]),
-    ... )
+    >>> positions, quaternions_xyzw = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), np.array([[0.0, 0.0, 0.0, 1.0]] * 2)
+    >>> path = Trajectory.without_covariances(np.array([0, 2_000_000_000]), positions, quaternions_xyzw)
     >>> path.at(np.array([1_000_000_000])).positions
     array([[0.5, 0. , 0. ]])
     """
@@ -76,9 +73,8 @@ class Trajectory:
         return len(self.stamps_ns)
 
     def __repr__(self) -> str:
-        return f"Trajectory({len(self)} poses" + (
-            f", {self.stamps_ns[0]} to {self.stamps_ns[-1]} ns)" if len(self) else ")"
-        )
+        span = f", {self.stamps_ns[0]} to {self.stamps_ns[-1]} ns" if len(self) else ""
+        return f"Trajectory({len(self)} poses{span})"
 
     @classmethod
     def from_estimates(cls, estimates: list[Estimate]) -> Trajectory:
@@ -108,28 +104,19 @@ class Trajectory:
 
     def rows(self, selection: slice | Ints) -> Trajectory:
         """The trajectory with only the selected rows."""
-        return Trajectory(
-            self.stamps_ns[selection],
-            self.positions[selection],
-            self.quaternions_xyzw[selection],
-            self.covariances[selection],
-        )
+        return Trajectory(*(getattr(self, column.name)[selection] for column in fields(self)))
 
     def at(self, stamps_ns: Ints) -> Trajectory:
         """Poses at other instants: position linear, rotation along the shortest arc; without covariances.
 
-        Raises
-        ------
-        MeasurementError
-            When an instant lies outside the trajectory.
+        Raises `MeasurementError` when an instant lies outside the trajectory.
         """
         if len(stamps_ns) and (stamps_ns[0] < self.stamps_ns[0] or stamps_ns[-1] > self.stamps_ns[-1]):
             raise MeasurementError("Trajectory.at: an instant lies outside it; select the common time span first")
         after = np.clip(np.searchsorted(self.stamps_ns, stamps_ns, side="right"), 1, len(self) - 1)
         before = after - 1
-        elapsed_ns = stamps_ns - self.stamps_ns[before]
         interval_ns = np.maximum(self.stamps_ns[after] - self.stamps_ns[before], 1)
-        share = (elapsed_ns / interval_ns)[:, None]
+        share = ((stamps_ns - self.stamps_ns[before]) / interval_ns)[:, None]
         start, end = Rotation.from_quat(self.quaternions_xyzw[before]), Rotation.from_quat(self.quaternions_xyzw[after])
         quaternions = (start * Rotation.from_rotvec(share * (start.inv() * end).as_rotvec())).as_quat()
         positions = self.positions[before] + share * (self.positions[after] - self.positions[before])
@@ -144,10 +131,9 @@ class CausalEstimates:
 
     def keep(self, estimate: Estimate) -> None:
         """Append an estimate; one for the same instant replaces the last, an earlier one is ignored."""
-        last_ns = self._estimates[-1].stamp_ns if self._estimates else None
-        if last_ns is None or estimate.stamp_ns > last_ns:
+        if not self._estimates or estimate.stamp_ns > self._estimates[-1].stamp_ns:
             self._estimates.append(estimate)
-        elif estimate.stamp_ns == last_ns:
+        elif estimate.stamp_ns == self._estimates[-1].stamp_ns:
             self._estimates[-1] = estimate
 
     def trajectory(self) -> Trajectory:
@@ -211,7 +197,7 @@ class DetectionLog:
 
     Examples
     --------
-    Detections used, and NIS of those that were predicted, of an estimator that has run:
+    Number of detections used by an estimator that has run:
 
     >>> def used(log: DetectionLog) -> int:
     ...     return sum(outcome is Outcome.USED for outcome in log.outcomes)

@@ -18,7 +18,6 @@ from sonar_graph.measurements import (
     Measurements,
     no_posterior,
     possible_ranges,
-    too_large,
 )
 
 
@@ -93,8 +92,8 @@ def test_numbers_without_a_meaning_for_not_measured_must_be_finite(bad):
 @pytest.mark.parametrize(
     ("stamps", "expected"),
     [
-        (np.array([0.0, 0.005, 0.01]), "expected integer nanoseconds, not float64"),
-        (np.array([0.0, 5e6, 1e7]), "expected integer nanoseconds, not float64"),
+        (np.array([0.0, 0.005, 0.01]), r"expected integers, not float64; of seconds: np\.round\(seconds \* 1e9\)"),
+        (np.array([0.0, 5e6, 1e7]), "expected integers, not float64; of seconds"),
         (np.array([[0, 1, 2]]), r"expected shape \(n,\), not \(1, 3\)"),
     ],
 )
@@ -159,6 +158,11 @@ UNSAID = np.full((2, 2, 2), np.nan)
         ({"id_probability": [[0.9]] * 2}, r"id_probability: expected shape \(n, k\).*not \(2, 1\)"),
         ({"candidate_ids": np.empty((2, 0)), "id_probability": np.empty((2, 0))}, r"candidate_ids: expected shape"),
         ({"candidate_ids": [[1, 2], [1, 2**56]]}, r"candidate_ids: row 1 .* has an identity of 2\^56 or more; number"),
+        (
+            {"candidate_ids": [[1, 2], [2**63 - 1, 2]]},
+            r"candidate_ids: row 1 .* has an identity of 2\^56 or more; number",
+        ),
+        ({"track": [[1], [2]]}, r"track: expected shape \(2,\), not \(2, 1\)"),
         ({"candidate_ids": np.array([[1, 2], [1, 2**63]], np.uint64)}, r"candidate_ids: expected integers below 2\^63"),
         ({"id_probability": [[0.9, 0.1], [97.0, 1.0]]}, r"id_probability: row 1 .* has probabilities .* 97 % is 0\.97"),
         ({"id_probability": [[0.9, 0.2], [0.9, 0.1]]}, r"id_probability: row 0 .* more than 1 in sum"),
@@ -208,5 +212,3 @@ def test_the_largest_identity_is_the_last_that_a_key_gives_back():
     assert gtsam.Symbol(gtsam.symbol("l", largest)).index() == largest
     with pytest.raises((ValueError, RuntimeError)):
         gtsam.symbol("l", FIRST_TOO_LARGE_ID)
-    ids = np.array([[-1, largest], [FIRST_TOO_LARGE_ID, -1], [3, 2**63 - 1]])
-    assert too_large(ids).tolist() == [False, True, True]

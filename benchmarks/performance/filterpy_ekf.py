@@ -208,7 +208,7 @@ class _Feed:
         (motion,) = self.motions(stamps_ns, reached_ns)
         sigma_m_s = math.sqrt(0.5 * sum(variances))
         self.opened_ns = self.node_ns
-        found = gravity_direction(motion, *ends, sigma_m_s, calibration.imu, calibration.gravity_m_s2)
+        found = gravity_direction(motion, *ends, sigma_m_s, calibration)
         if found is None:
             return
         up, sigma = found
@@ -232,8 +232,8 @@ class _Feed:
         detections = self.sequence.detections
         assert detections is not None
         one = detections.rows(slice(row, row + 1))
-        identity = identify(one, MINIMUM_ID_PROBABILITY)
-        if identity.refusals[0] is not None:
+        ids, refusals = identify(one, MINIMUM_ID_PROBABILITY)
+        if refusals[0] is not None:
             return
         sonar = self.slam.calibration.sonar
         R = one.range_azimuth_cov[0]
@@ -241,7 +241,7 @@ class _Feed:
             R = np.diag([sonar.range_sigma_m**2, sonar.azimuth_sigma_rad**2])
         z = np.array([one.range_m[0], one.azimuth_rad[0]])
         motion = self.provisional(int(one.stamps_ns[0]))
-        self.slam.timed(lambda: self.slam.detect(motion, int(identity.ids[0]), z, R))
+        self.slam.timed(lambda: self.slam.detect(motion, int(ids[0]), z, R))
 
 
 def run(sequence: Sequence, until_ns: int, *, predicts_by_node: bool = False) -> FilterpyRun:

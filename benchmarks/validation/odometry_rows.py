@@ -129,7 +129,7 @@ def gravity(sequence: Sequence, n: int, motion: JointMotion) -> gtsam.NonlinearF
     at_imu = sequence.dvl.velocity[rows] @ log.rotation().matrix().T
     at_imu = at_imu + np.cross(rates, imu.translation() - log.translation())
     sigma = float(np.sqrt(np.mean(np.square(calibration.dvl.velocity_sigma_m_s))))
-    told = gravity_direction(motion.relative_pose(), *at_imu, sigma, calibration.imu, calibration.gravity_m_s2)
+    told = gravity_direction(motion.relative_pose(), *at_imu, sigma, calibration)
     assert told is not None
     return factors.gravity_direction(X(n + 1), *told)
 

@@ -23,14 +23,14 @@ from sonar_graph.motion import Motions
 from sonar_graph.navigation.steps import Rows, has_gap, hole_from, put, row, rows_until, step_from
 from sonar_graph.numerics import (
     I3,
+    O3,
     Mat6,
     Vec3,
-    block,
     compiled,
     cross,
     diagonal,
     exp_and_mean,
-    inverse_adjoint,
+    mat,
     skew,
     store,
     store6,
@@ -93,9 +93,9 @@ def _write_motions(
         i, k = rows_until(rows.imu_ns, t), rows_until(rows.dvl_ns, t)
         imu_rows, dvl_rows = rows_until(rows.imu_ns, known_ns[e]), max(rows_until(rows.known_ns, known_ns[e]), 1)
         at = 5 * n + 3 * e
-        R, p, f = block(sums, 3 * e, 0), row(sums, 3 * n + e), row(sums, 4 * n + e)
-        tt, rt, rr = block(sums, at, 0), block(sums, at + 3 * n, 0), block(sums, at + 6 * n, 0)
-        D_t, D_r = block(sums, at + 9 * n, 0), block(sums, at + 12 * n, 0)
+        R, p, f = mat(sums, 3 * e, 0), row(sums, 3 * n + e), row(sums, 4 * n + e)
+        tt, rt, rr = mat(sums, at, 0), mat(sums, at + 3 * n, 0), mat(sums, at + 6 * n, 0)
+        D_t, D_r = mat(sums, at + 9 * n, 0), mat(sums, at + 12 * n, 0)
         if has_gap(rows.dvl_ns, dvl_rows, k, t, end, longest_ns):
             t, R, p, f = end, np.nan * I3, NOWHERE, NOWHERE
         while t < end:
@@ -127,7 +127,7 @@ def _write_motions(
         store(rr, sums, at + 6 * n, 0)
         store(D_t, sums, at + 9 * n, 0)
         store(D_r, sums, at + 12 * n, 0)
-        to_j = inverse_adjoint(R, p)
+        to_j = Mat6(R.T, O3, -1.0 * (R.T @ skew(p)), R.T)  # Ad of the inverse of (R, p)
         store6(to_j @ Mat6(tt, rt.T, rt, rr) @ to_j.T, C, 6 * e)
         store(to_j.a @ D_t, D, 6 * e, 0)
         store(to_j.c @ D_t + to_j.d @ D_r, D, 6 * e + 3, 0)

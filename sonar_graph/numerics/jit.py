@@ -16,25 +16,11 @@ COMPILED_IN: Counter[str] = Counter()
 """Number of compiled functions of each module."""
 
 
-def compiled(function: Compiled) -> Compiled:
+def compiled(function: Compiled, *, forceinline: bool = False) -> Compiled:
     """Compile to machine code at the first call; the code is cached beside the source.
 
     It is compiled again when the contents of its file change, or of a file whose compiled functions it can call.
     """
-    return _compiled(function, forceinline=False)
-
-
-def inlined(function: Compiled) -> Compiled:
-    """Compile as `compiled`, and inline into every caller: for the steps of a loop over samples.
-
-    In such a loop a call that passes tuples costs as much as the arithmetic of a step, and tuples stay in registers
-    only within one function. Elsewhere inlining gains nothing and costs compile time, since the code is compiled in
-    every caller.
-    """
-    return _compiled(function, forceinline=True)
-
-
-def _compiled(function: Compiled, *, forceinline: bool) -> Compiled:
     assert isinstance(function, FunctionType)
     COMPILED_IN[function.__module__] += 1
     made = numba.njit(cache=True, error_model="numpy", forceinline=forceinline)(function)
@@ -42,6 +28,14 @@ def _compiled(function: Compiled, *, forceinline: bool) -> Compiled:
         # numba's own stamp is of the function's file alone, and in its older versions of the file's time
         cast(Any, made)._cache._cache_file._source_stamp = _digest(function.__globals__)
     return cast(Compiled, made)
+
+
+def inlined(function: Compiled) -> Compiled:
+    """Compile as `compiled`, and inline into every caller: for the steps of a loop over samples.
+
+    There, tuples stay in registers only within one function. Elsewhere it just costs compile time in every caller.
+    """
+    return compiled(function, forceinline=True)
 
 
 def _digest(module: dict[str, Any]) -> str:

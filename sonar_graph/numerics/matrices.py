@@ -2,17 +2,9 @@
 
 They are tuples. Inside a compiled function they live in registers, where an array of nine numbers is an allocation that
 costs as much as a product; outside, the same operators are ordinary methods. Rotations follow Forster et al.,
-"On-Manifold Preintegration", IEEE TRO 33(1), 2017, (3), (8). Euler angles are roll, pitch and yaw (phi, theta, psi)::
-
-    world_R_body = Rz(psi) Ry(theta) Rx(phi)
-    w = W (phi', theta', psi')^T        body rates from Euler rates
-    (phi', theta', psi')^T = E w        E = W^-1; infinite at theta = +-90 degrees
-
-A small rotation of the body, ``world_R_body Exp(delta)``, changes the angles by ``E delta``. Fossen, "Handbook of
-Marine Craft Hydrodynamics and Motion Control", 2011, (2.18), (2.28).
+"On-Manifold Preintegration", IEEE TRO 33(1), 2017, (3), (8); Euler angles, roll, pitch and yaw (phi, theta, psi),
+Fossen, "Handbook of Marine Craft Hydrodynamics and Motion Control", 2011, (2.18), (2.28).
 """
-
-from __future__ import annotations
 
 import math
 import operator
@@ -28,7 +20,7 @@ from sonar_graph.numerics.jit import inlined
 
 
 class Operators:
-    """Operators by the kinds of both operands, `RULES`."""
+    """Base class with the operators in `RULES`."""
 
     __array_ufunc__ = None  # numpy's numbers leave `s * A` to the rules
 
@@ -71,8 +63,7 @@ class Mat6(Operators, NamedTuple("Mat6", [("a", Mat3), ("b", Mat3), ("c", Mat3),
 
 
 extending: Any = numba.extending
-Rule = Callable[[Any, Any], Any]
-RULES: dict[str, dict[tuple[type, type], Rule]] = {
+RULES: dict[str, dict[tuple[type, type], Callable[[Any, Any], Any]]] = {
     "add": {
         (Vec3, Vec3): lambda a, b: Vec3(a.x + b.x, a.y + b.y, a.z + b.z),
         (Mat3, Mat3): lambda a, b: Mat3(a.x + b.x, a.y + b.y, a.z + b.z),
@@ -99,7 +90,7 @@ RULES: dict[str, dict[tuple[type, type], Rule]] = {
         ),
     },
 }
-"""Operators by the kinds of both operands; the first that fits counts."""
+"""Operators by the kinds of both operands."""
 TRANSPOSES: dict[type, Callable[[Any], Any]] = {
     Mat3: lambda a: Mat3(Vec3(a.x.x, a.y.x, a.z.x), Vec3(a.x.y, a.y.y, a.z.y), Vec3(a.x.z, a.y.z, a.z.z)),
     Mat6: lambda a: Mat6(a.a.T, a.c.T, a.b.T, a.d.T),
@@ -115,26 +106,12 @@ def _compiled_kind(t: types.Type) -> Any:
     return float if isinstance(t, types.Float | types.Integer) else getattr(t, "instance_class", None)
 
 
-def _install(name: str, op: Callable[..., Any]) -> None:
-    """Give an operator to compiled code, inlined: tuples stay in registers only within one function."""
-
-    def rule(a: Any, b: Any) -> Rule | None:
-        return RULES[name].get((_compiled_kind(a), _compiled_kind(b)))
-
-    extending.overload(op, jit_options=INLINE, strict=False)(rule)
-
-
-INLINE: Any = {"forceinline": True, "error_model": "numpy"}
+# the same for compiled code, inlined: tuples stay in registers only within one function
+INLINE: Any = {"jit_options": {"forceinline": True, "error_model": "numpy"}, "strict": False}
 for _op in (operator.add, operator.iadd, operator.sub, operator.isub, operator.mul, operator.matmul):
-    _install(_op.__name__.lstrip("i"), _op)
-
-
-def _transpose(a: Any) -> Callable[[Any], Any] | None:
-    return TRANSPOSES.get(_compiled_kind(a))
-
-
-extending.overload_attribute(types.NamedUniTuple, "T", jit_options=INLINE, strict=False)(_transpose)
-
+    _rules = RULES[_op.__name__.lstrip("i")]
+    extending.overload(_op, **INLINE)(lambda a, b, r=_rules: r.get((_compiled_kind(a), _compiled_kind(b))))
+extending.overload_attribute(types.NamedUniTuple, "T", **INLINE)(lambda a: TRANSPOSES.get(_compiled_kind(a)))
 
 ZERO = Vec3(0.0, 0.0, 0.0)
 O3 = Mat3(ZERO, ZERO, ZERO)
@@ -166,15 +143,8 @@ def vec(a: Any) -> Vec3:
 
 
 @inlined
-def mat(A: Any) -> Mat3:
-    """Matrix from the first three rows and columns of an array."""
-    return Mat3(Vec3(A[0, 0], A[0, 1], A[0, 2]), Vec3(A[1, 0], A[1, 1], A[1, 2]), Vec3(A[2, 0], A[2, 1], A[2, 2]))
-
-
-@inlined
-def block(A: Floats, row: int, column: int) -> Mat3:
-    """3 × 3 block of an array, its first element at (row, column)."""
-    r, c = row, column
+def mat(A: Floats, r: int = 0, c: int = 0) -> Mat3:
+    """3 × 3 block of an array, its first element at row r and column c."""
     return Mat3(
         Vec3(A[r, c], A[r, c + 1], A[r, c + 2]),
         Vec3(A[r + 1, c], A[r + 1, c + 1], A[r + 1, c + 2]),
@@ -185,13 +155,12 @@ def block(A: Floats, row: int, column: int) -> Mat3:
 @inlined
 def mat6(A: Floats) -> Mat6:
     """Matrix from the first six rows and columns of an array."""
-    return Mat6(block(A, 0, 0), block(A, 0, 3), block(A, 3, 0), block(A, 3, 3))
+    return Mat6(mat(A, 0, 0), mat(A, 0, 3), mat(A, 3, 0), mat(A, 3, 3))
 
 
 @inlined
-def store(A: Mat3, out: Floats, row: int, column: int) -> None:
-    """Write a matrix into an array, its first element at (row, column)."""
-    r, c = row, column
+def store(A: Mat3, out: Floats, r: int, c: int) -> None:
+    """Write a matrix into an array, its first element at row r and column c."""
     out[r, c], out[r, c + 1], out[r, c + 2] = A.x.x, A.x.y, A.x.z
     out[r + 1, c], out[r + 1, c + 1], out[r + 1, c + 2] = A.y.x, A.y.y, A.y.z
     out[r + 2, c], out[r + 2, c + 1], out[r + 2, c + 2] = A.z.x, A.z.y, A.z.z
@@ -204,12 +173,6 @@ def store6(A: Mat6, out: Floats, row: int = 0) -> None:
     store(A.c.T, out, row, 3)
     store(A.c, out, row + 3, 0)
     store(0.5 * (A.d + A.d.T), out, row + 3, 3)
-
-
-@inlined
-def inverse_adjoint(R: Mat3, p: Vec3) -> Mat6:
-    """Ad of the inverse of a pose: ``[[R^T, 0], [-R^T [p]x, R^T]]``."""
-    return Mat6(R.T, O3, -1.0 * (R.T @ skew(p)), R.T)
 
 
 @inlined
@@ -240,7 +203,7 @@ def rodrigues(phi: Vec3, x: float, a: float, b: float) -> Mat3:
 
 @inlined
 def rotation_from_euler(angles: Vec3) -> Mat3:
-    """world_R_body from (phi, theta, psi), rad."""
+    """``world_R_body = Rz(psi) Ry(theta) Rx(phi)`` from (phi, theta, psi), rad."""
     c_r, s_r = math.cos(angles.x), math.sin(angles.x)
     c_p, s_p = math.cos(angles.y), math.sin(angles.y)
     c_y, s_y = math.cos(angles.z), math.sin(angles.z)
@@ -259,13 +222,13 @@ def euler_from_rotation(R: Mat3) -> Vec3:
 
 @inlined
 def body_rates_from_euler(angles: Vec3) -> Mat3:
-    """W of the module's docstring."""
+    """W: body rates are ``w = W (phi', theta', psi')^T``."""
     c_r, s_r, c_p, s_p = math.cos(angles.x), math.sin(angles.x), math.cos(angles.y), math.sin(angles.y)
     return Mat3(Vec3(1.0, 0.0, -s_p), Vec3(0.0, c_r, s_r * c_p), Vec3(0.0, -s_r, c_r * c_p))
 
 
 @inlined
 def euler_rates_from_body(angles: Vec3) -> Mat3:
-    """E of the module's docstring."""
+    """``E = W^-1``, infinite at theta = ±90°; ``world_R_body Exp(delta)`` has angles that differ by ``E delta``."""
     c_r, s_r, c_p, t_p = math.cos(angles.x), math.sin(angles.x), math.cos(angles.y), math.tan(angles.y)
     return Mat3(Vec3(1.0, s_r * t_p, c_r * t_p), Vec3(0.0, c_r, -s_r), Vec3(0.0, s_r / c_p, c_r / c_p))

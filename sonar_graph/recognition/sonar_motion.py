@@ -52,7 +52,7 @@ class _Tilt:
         """Measured direction of up at an epoch, and its standard deviation."""
         (before, variance), (after, other) = map(self._odometry.velocity_at_imu, (self.epoch_ns, epoch_ns))
         sigma = float(np.sqrt(0.5 * (variance + other)))
-        return gravity_direction(motion, before, after, sigma, self._calibration.imu, self._calibration.gravity_m_s2)
+        return gravity_direction(motion, before, after, sigma, self._calibration)
 
 
 class _Height:

@@ -247,7 +247,7 @@ class Keyframes:
             return
         (v_i, variance_i), (v_j, variance_j) = map(self.odometry.velocity_at_imu, (self.stamps_ns[-1], node_ns))
         sigma = float(np.sqrt(0.5 * (variance_i + variance_j)))
-        up = gravity_direction(motion, v_i, v_j, sigma, self.calibration.imu, self.calibration.gravity_m_s2)
+        up = gravity_direction(motion, v_i, v_j, sigma, self.calibration)
         if up:
             self.smoother.add({"gravity": factors.gravity_direction(X(j), *up)})
 

@@ -236,6 +236,7 @@ def test_velocities_count_from_the_first_to_the_last_of_the_rest():
 
 GRAVITY = np.array([0.0, 0.0, G])
 IMU = ImuCalibration(accel_noise_density=2e-3, accel_bias_sigma=5e-3, gyro_noise_density=2e-3, gyro_bias_sigma=1e-3)
+MOVING = Calibration(imu=IMU, gravity_m_s2=G)
 """A gyro that drifts so fast that directions a second apart share next to nothing."""
 T, N, FROM_S = 1.0, 2000, 2.0
 
@@ -254,17 +255,17 @@ def accelerated() -> tuple[PreintegratedMotion, Floats, Floats, Rotation]:
 
 def tilt_sigma_at_rest(duration_s: float, velocity_sigma: float, imu: ImuCalibration) -> float:
     still = PreintegratedMotion(gtsam.Pose3(), np.eye(6), np.zeros((6, 3)), np.zeros(3), duration_s, GRAVITY)
-    return gravity_direction(still, np.zeros(3), np.zeros(3), velocity_sigma, imu, G)[1]
+    return gravity_direction(still, np.zeros(3), np.zeros(3), velocity_sigma, Calibration(imu=imu, gravity_m_s2=G))[1]
 
 
 def test_up_is_found_in_a_moving_vehicle():
     """And would be off by degrees, were the vehicle's own acceleration left in."""
     motion, v_i, v_j, end = accelerated()
     truth = end.inv().apply([0, 0, 1.0])
-    up, _ = gravity_direction(motion, v_i, v_j, 0.01, IMU, G)
+    up, _ = gravity_direction(motion, v_i, v_j, 0.01, MOVING)
     assert np.linalg.norm(up) == pytest.approx(1)
     assert np.linalg.norm(np.cross(up, truth)) < 1e-4
-    naive, _ = gravity_direction(motion, np.zeros(3), np.zeros(3), 0.01, IMU, G)
+    naive, _ = gravity_direction(motion, np.zeros(3), np.zeros(3), 0.01, MOVING)
     assert np.arccos(naive @ truth) > np.radians(1)
 
 
@@ -277,7 +278,7 @@ def test_stated_sigma_is_that_of_many_noisy_intervals():
         force = motion.mean_specific_force + IMU.accel_noise_density / np.sqrt(T) * rng.standard_normal(3)
         noisy = replace(motion, mean_specific_force=force + IMU.accel_bias_sigma * rng.standard_normal(3))
         scatter = velocity_sigma * rng.standard_normal((2, 3))
-        up, sigma = gravity_direction(noisy, v_i + scatter[0], v_j + scatter[1], velocity_sigma, IMU, G)
+        up, sigma = gravity_direction(noisy, v_i + scatter[0], v_j + scatter[1], velocity_sigma, MOVING)
         up = up + np.cross(by_gyros * rng.standard_normal(3), up)
         squares.append(np.sum((level @ up / sigma) ** 2))
     check_consistent(squares, 2, confidence=0.999)
@@ -323,7 +324,7 @@ def test_what_the_gyros_do_meanwhile_is_in_the_tilt(duration_s):
 
 def test_without_forces_there_is_no_direction():
     unfelt = replace(accelerated()[0], mean_specific_force=np.full(3, np.nan))
-    assert gravity_direction(unfelt, np.zeros(3), np.zeros(3), 0.01, IMU, G) is None
+    assert gravity_direction(unfelt, np.zeros(3), np.zeros(3), 0.01, MOVING) is None
 
 
 @pytest.mark.parametrize(("latitude_deg", "rate"), [(0, [0, 15.041, 0]), (90, [0, 0, 15.041]), (-90, [0, 0, -15.041])])

@@ -36,9 +36,9 @@ REPEATED, NO_IDENTITY = Outcome.REPEATED, Outcome.NO_IDENTITY
     ids=["from the threshold on", "however low the threshold", "once a frame, of equals the first"],
 )
 def test_the_most_probable_identity_is_accepted(rows: tuple, least: float, ids: list[int], refusals: list) -> None:
-    found = identify(stated(*rows), least)
-    assert found.ids.tolist() == ids
-    assert found.refusals == refusals
+    found, why = identify(stated(*rows), least)
+    assert found.tolist() == ids
+    assert why == refusals
 
 
 def test_a_row_is_amended_in_its_place_and_loses_its_innovation():

@@ -27,7 +27,6 @@ from sonar_graph.measurements import (
     LandmarkDetections,
     no_posterior,
     possible_ranges,
-    too_large,
 )
 from sonar_graph.states import LandmarkMap
 
@@ -58,7 +57,7 @@ class _Joined:
         self.values = [np.concatenate(columns) for columns in zip(*(part.values for part in parts), strict=True)]
         self.ids = np.concatenate([_padded(part.ids, most, -1) for part in parts])
         self.probabilities = np.concatenate([_padded(part.probabilities, most, 0) for part in parts])
-        if (large := too_large(self.ids)).any():
+        if (large := (self.ids >= FIRST_TOO_LARGE_ID).any(axis=1)).any():
             where = f"message {self.message[int(np.argmax(large))]} has an identity of 2^56 or more"
             raise topic.error(f"{where}; {ID_ADVICE}, or do not use them: [detections] use = false")
 

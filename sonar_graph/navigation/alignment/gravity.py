@@ -15,70 +15,51 @@ import math
 
 import numpy as np
 
-from sonar_graph.calibration import Calibration, ImuCalibration
+from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Floats
 from sonar_graph.motion import PreintegratedMotion
+from sonar_graph.numerics import compiled, mat, vec
 
 LEAST_GYRO_NOISE_DENSITY = 1e-7
 """rad/s/√Hz, ten times below the best fibre gyros: keeps tau finite for a gyro without noise."""
+EARTH_RATE_RAD_S = 7.292115e-5
+"""WGS 84."""
 
 
 def gravity_direction(
-    motion: PreintegratedMotion,
-    velocity_i: Floats,
-    velocity_j: Floats,
-    velocity_sigma_m_s: float,
-    imu: ImuCalibration,
-    gravity_m_s2: float,
+    motion: PreintegratedMotion, velocity_i: Floats, velocity_j: Floats, sigma_m_s: float, calibration: Calibration
 ) -> tuple[Floats, float] | None:
-    """Measure the world's up in frame j.
+    """The unit vector up_j, shape (3,), and the standard deviation of a small tilt of it, rad.
 
-    Parameters
-    ----------
-    motion
-        From epoch i to epoch j, with the mean specific force.
-    velocity_i, velocity_j
-        Velocity of the IMU's point in body axes at the two epochs, shape (3,), m/s.
-    velocity_sigma_m_s
-        Standard deviation of one component of either velocity.
-
-    Returns
-    -------
-    The unit vector ``body_R_world e_z`` at epoch j, shape (3,), and the standard deviation of a small tilt of it, rad.
-    None where the specific force was not measured.
+    ``motion`` leads from epoch i to epoch j; the velocities are of the IMU's point in body axes at both, shape (3,),
+    m/s, each component with ``sigma_m_s``. None where the specific force was not measured.
     """
-    up_j = up_direction(
-        motion.mean_specific_force, motion.i_T_j.rotation().matrix(), velocity_i, velocity_j, motion.duration_s
-    )
+    i_R_j = motion.i_T_j.rotation().matrix()
+    up_j = up_direction(motion.mean_specific_force, i_R_j, velocity_i, velocity_j, motion.duration_s)
     if not np.isfinite(up_j).all():
         return None
-    return up_j, tilt_sigma(motion.duration_s, velocity_sigma_m_s, imu, gravity_m_s2)
+    return up_j, tilt_sigma(motion.duration_s, sigma_m_s, calibration)
 
 
-def up_direction(
-    mean_force: Floats, i_R_j: Floats, velocity_i: Floats, velocity_j: Floats, duration_s: float
-) -> Floats:
-    """up_j of the module's equation, shape (3,); NaN where the force is not measured."""
-    up_j = i_R_j.T @ (mean_force - (i_R_j @ velocity_j - velocity_i) / duration_s)
-    return np.asarray(up_j / math.sqrt(up_j @ up_j))
+@compiled
+def up_direction(force: Floats, i_R_j: Floats, velocity_i: Floats, velocity_j: Floats, duration_s: float) -> Floats:
+    """up_j of the mean specific force in frame i, shape (3,); NaN where the force is not measured."""
+    dR = mat(i_R_j)
+    g_j = dR.T @ (vec(force) - (1.0 / duration_s) * (dR @ vec(velocity_j) - vec(velocity_i)))
+    return np.array((1.0 / math.sqrt(g_j @ g_j)) * g_j)
 
 
-def tilt_sigma(duration_s: float, velocity_sigma_m_s: float, imu: ImuCalibration, gravity_m_s2: float) -> float:
+def tilt_sigma(duration_s: float, velocity_sigma_m_s: float, calibration: Calibration) -> float:
     """Standard deviation of the direction's tilt, rad."""
-    noise = (imu.accel_noise_density**2 / duration_s + 2.0 * (velocity_sigma_m_s / duration_s) ** 2) / gravity_m_s2**2
+    imu, g = calibration.imu, calibration.gravity_m_s2
+    noise = (imu.accel_noise_density**2 / duration_s + 2.0 * (velocity_sigma_m_s / duration_s) ** 2) / g**2
     noise += imu.gyro_noise_density**2 * duration_s / 3.0 + (imu.gyro_bias_sigma * duration_s) ** 2 / 4.0
-    beta = imu.accel_bias_sigma / gravity_m_s2
+    beta = imu.accel_bias_sigma / g
     tau_s = (beta / max(imu.gyro_noise_density, LEAST_GYRO_NOISE_DENSITY)) ** 2
     return math.sqrt(noise + beta**2 * max(1.0, tau_s / duration_s))
-
-
-EARTH_RATE_RAD_S = 7.292115e-5
-"""WGS 84."""
 
 
 def earth_rate_in_world(calibration: Calibration) -> Floats | None:
     """Earth's angular rate in a world with x east, y north, z up, shape (3,), rad/s; None without a latitude."""
     latitude = calibration.earth_rate_latitude_rad
-    if latitude is None:
-        return None
-    return EARTH_RATE_RAD_S * np.array([0.0, np.cos(latitude), np.sin(latitude)])
+    return None if latitude is None else EARTH_RATE_RAD_S * np.array([0.0, np.cos(latitude), np.sin(latitude)])

@@ -1,8 +1,5 @@
 """Identities as a recogniser states them, accepted where their posterior is high enough, and the gate's threshold."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass
 from functools import cache
 
 from scipy.stats import chi2
@@ -11,26 +8,11 @@ from sonar_graph.measurements import Ints, LandmarkDetections
 from sonar_graph.states import Outcome
 
 
-@dataclass(frozen=True, eq=False)
-class Identities:
-    """Identity of each detection of a block, or the reason why it has none."""
+def identify(detections: LandmarkDetections, minimum_probability: float) -> tuple[Ints, list[Outcome | None]]:
+    """Most probable identity of each row, shape (n,), and the reason why it is refused; None where it is accepted.
 
-    ids: Ints
-    """Most probable identity, shape (n,)."""
-    refusals: list[Outcome | None]
-    """None where the identity is accepted, length n."""
-
-
-def identify(detections: LandmarkDetections, minimum_probability: float) -> Identities:
-    """Accept the most probable identity of each row where its posterior is high enough.
-
-    A landmark is in one place: of several rows of one frame with one identity the most probable is accepted, the first
-    of equals.
-
-    Parameters
-    ----------
-    minimum_probability
-        Rows whose highest posterior is below it, or is not a number, or belongs to no identity (-1), are refused.
+    Refused is a posterior that is too low or NaN, or of no identity (-1). A landmark is in one place: of several rows
+    of one frame with one identity the most probable is accepted, the first of equals.
     """
     ids, probability = detections.most_probable()
     rows = zip(detections.stamps_ns.tolist(), ids.tolist(), probability.tolist(), strict=True)
@@ -45,7 +27,7 @@ def identify(detections: LandmarkDetections, minimum_probability: float) -> Iden
                 best[stamp_ns, landmark_id] = row, p
             if other != row:
                 refusals[other if p > other_p else row] = Outcome.REPEATED
-    return Identities(ids, refusals)
+    return ids, refusals
 
 
 @cache

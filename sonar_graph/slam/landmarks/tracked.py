@@ -154,10 +154,8 @@ class TrackedIdentities:
             waits |= unnamed(frame)
         kept = [row for row, why in enumerate(refusals) if why is None]
         if len(kept) == len(frame):
-            return Screened(identify(frame, self._minimum_probability).refusals, waits.tolist())
-        for row, why in zip(
-            kept, identify(frame.rows(np.array(kept)), self._minimum_probability).refusals, strict=True
-        ):
+            return Screened(identify(frame, self._minimum_probability)[1], waits.tolist())
+        for row, why in zip(kept, identify(frame.rows(np.array(kept)), self._minimum_probability)[1], strict=True):
             refusals[row] = why
         return Screened(refusals, [wait and row in kept for row, wait in enumerate(waits.tolist())])
 

@@ -23,8 +23,8 @@ from sonar_graph.numerics import compiled
 FLOOR_GATE = 10.83
 """Gate for "the landmark stands on the floor": the 0.999 quantile of chi-square with one degree of freedom.
 
-The landmark is placed at elevation 0 and its height compared with the floor's. It is not on the floor if the squared
-difference, divided by its variance from elevation, pose and floor, exceeds the gate."""
+It gates the squared difference of the height at elevation 0 from the floor's, over its variance from elevation, pose
+and floor."""
 
 
 @compiled
@@ -35,25 +35,12 @@ def wrap_angle(angle_rad: float) -> float:
 
 @compiled
 def project(q: Floats) -> tuple[Floats, Floats]:
-    """Range and azimuth of a point in the sonar frame.
-
-    Parameters
-    ----------
-    q
-        Shape (3,), m.
-
-    Returns
-    -------
-    (range m, azimuth rad), shape (2,), and D_q, their derivative by q, shape (2, 3).
-    """
-    rho2 = q[0] * q[0] + q[1] * q[1]
-    range_m = math.sqrt(rho2 + q[2] * q[2])
-    z = np.array([range_m, math.atan2(q[1], q[0])])
-    D_q = np.zeros((2, 3))
-    for axis in range(3):
-        D_q[0, axis] = q[axis] / range_m
-    D_q[1, 0], D_q[1, 1] = -q[1] / rho2, q[0] / rho2
-    return z, D_q
+    """(range m, azimuth rad), shape (2,), of a point in the sonar frame, and D_q, shape (2, 3)."""
+    h2 = q[0] * q[0] + q[1] * q[1]
+    range_m, D_q = math.sqrt(h2 + q[2] * q[2]), np.zeros((2, 3))
+    D_q[0, 0], D_q[0, 1], D_q[0, 2] = q[0] / range_m, q[1] / range_m, q[2] / range_m
+    D_q[1, 0], D_q[1, 1] = -q[1] / h2, q[0] / h2
+    return np.array([range_m, math.atan2(q[1], q[0])]), D_q
 
 
 def sonar_point(range_m: float, azimuth_rad: float, elevation_rad: float) -> Floats:
@@ -65,13 +52,8 @@ def sonar_point(range_m: float, azimuth_rad: float, elevation_rad: float) -> Flo
 def sonar_point_jacobian(range_m: float, azimuth_rad: float, elevation_rad: float) -> Floats:
     """Derivative of `sonar_point` by (range, azimuth, elevation), shape (3, 3)."""
     ca, sa, ce, se = math.cos(azimuth_rad), math.sin(azimuth_rad), math.cos(elevation_rad), math.sin(elevation_rad)
-    return np.array(
-        [
-            [ce * ca, -range_m * ce * sa, -range_m * se * ca],
-            [ce * sa, range_m * ce * ca, -range_m * se * sa],
-            [se, 0.0, range_m * ce],
-        ]
-    )
+    level, height = range_m * ce, range_m * se
+    return np.array([[ce * ca, -level * sa, -height * ca], [ce * sa, level * ca, -height * sa], [se, 0.0, level]])
 
 
 def elevation_on_floor(
@@ -83,18 +65,8 @@ def elevation_on_floor(
 
         (a cos(azimuth) + b sin(azimuth)) cos(e) + c sin(e) = height / range
 
-    which is ``A cos(e - e0) = height / range``: of its two solutions the one nearer to the centre beam.
-
-    Parameters
-    ----------
-    floor_z_m
-        World z of the floor.
-    aperture_rad
-        Full vertical opening of the sonar.
-
-    Returns
-    -------
-    None when the floor is not within the aperture at that range and azimuth.
+    which is ``A cos(e - e0) = height / range``: of its two solutions the one nearer to the centre beam. None where the
+    floor, at a height ``floor_z_m`` in the world, is not within the full vertical aperture.
     """
     a, b, c = world_T_sonar.rotation().matrix()[2].tolist()
     level = a * math.cos(azimuth_rad) + b * math.sin(azimuth_rad)
