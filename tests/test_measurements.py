@@ -43,6 +43,16 @@ def test_window_excludes_its_beginning_and_includes_its_end_and_is_none_without_
     assert depth([10, 20]).between(20, 100) is None
 
 
+@given(sorted_stamps)
+def test_frames_are_the_rows_of_each_stamp(stamps_ns):
+    n = len(stamps_ns)
+    ids, posterior = np.arange(n)[:, None], np.ones((n, 1))
+    block = LandmarkDetections(np.array(stamps_ns), np.ones(n), np.zeros(n), np.full((n, 2, 2), np.nan), ids, posterior)
+    frames = list(block.frames())
+    assert [set(frame.stamps_ns.tolist()) for frame in frames] == [{stamp} for stamp in sorted(set(stamps_ns))]
+    assert LandmarkDetections.concatenate(frames).candidate_ids.tolist() == ids.tolist()
+
+
 @given(sorted_stamps, st.integers(0, 20))
 def test_concatenation_undoes_a_split(stamps_ns, at):
     block = depth(stamps_ns)
