@@ -17,7 +17,6 @@ from baselines.filter import (
     FRAME,
     GATED,
     NO_BIAS,
-    OPEN,
     USED,
     Events,
     FilterParams,
@@ -32,6 +31,7 @@ from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats
 from sonar_graph.motion import MotionSource
 from sonar_graph.numerics import compiled, rotation_from_euler, vec
+from sonar_graph.slam.landmarks import ACCEPTED
 
 SINGULAR_COSINE = 1e-3
 """Below this cosine of the pitch the Euler angles are taken as singular."""
@@ -57,7 +57,7 @@ def advance(
             correct_depth(x, P, dR[k], dp[k], C[k], port, events.z_m[row], events.variance_m2[row])
         elif kind == FRAME:
             while row < len(views.stamp_ns) and views.stamp_ns[row] == events.stamp_ns[k]:
-                if views.outcome[row] == OPEN:
+                if views.outcome[row] == ACCEPTED:
                     if views.landmark[row] < 0:
                         return k
                     is_used, views.e[row], views.S[row] = observe(

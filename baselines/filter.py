@@ -30,7 +30,7 @@ from sonar_graph.measurements import Floats, Ints, LandmarkDetections, Measureme
 from sonar_graph.motion import Motions, MotionSource, require_source
 from sonar_graph.navigation.alignment import earth_rate_in_world, tilt_sigma, up_direction
 from sonar_graph.numerics import compiled, cross, exp_and_mean, mat, store, vec
-from sonar_graph.slam.landmarks import gate_threshold, identify
+from sonar_graph.slam.landmarks import ACCEPTED, gate_threshold, identify
 from sonar_graph.slam.models import elevation_on_floor
 from sonar_graph.states import (
     OUTCOME_NUMBERS,
@@ -94,8 +94,6 @@ EPOCH, PLANE, GRAVITY, DEPTH, FRAME, END = range(6)
 """Kinds of events; at equal stamps the lower comes first, but plane and gravity right after their epoch."""
 USED, GATED, NEW = (OUTCOME_NUMBERS[outcome] for outcome in (Outcome.USED, Outcome.GATED, Outcome.NEW))
 NOT_STARTED, LONG_AGO = int(np.iinfo(np.int64).max), int(np.iinfo(np.int64).min)
-OPEN = -1
-"""In place of an outcome: the detection is to be used."""
 
 
 class Views(NamedTuple):
@@ -107,15 +105,15 @@ class Views(NamedTuple):
     z: Floats
     R_z: Floats
     outcome: NDArray[np.int8]
-    """`OUTCOME_NUMBERS`, or OPEN."""
+    """`OUTCOME_NUMBERS`, or ACCEPTED: to be used."""
     e: Floats
     S: Floats
 
 
-def open_rows(views: Views, first: int) -> list[int]:
+def accepted_rows(views: Views, first: int) -> list[int]:
     """Detections of a frame that are to be used, of which one is given."""
-    is_open = (views.stamp_ns == views.stamp_ns[first]) & (views.outcome == OPEN)
-    return np.flatnonzero(is_open).tolist()
+    is_accepted = (views.stamp_ns == views.stamp_ns[first]) & (views.outcome == ACCEPTED)
+    return np.flatnonzero(is_accepted).tolist()
 
 
 class Events(NamedTuple):
@@ -149,7 +147,7 @@ def in_order(
     Parameters
     ----------
     since_ns
-        Depth samples stamped earlier are passed over, and detections that are not open.
+        Depth samples stamped earlier are passed over, and detections that are not accepted.
     node_ns, opened_ns, interval_ns
         Epochs of the state and at which the interval of gravity began, and its least length; 0: no gravity.
     """
@@ -162,7 +160,7 @@ def in_order(
         else:
             while d < len(depth_ns) and depth_ns[d] < since_ns:
                 d += 1
-            while r < len(views.stamp_ns) and (views.stamp_ns[r] == frame_ns or views.outcome[r] != OPEN):
+            while r < len(views.stamp_ns) and (views.stamp_ns[r] == frame_ns or views.outcome[r] != ACCEPTED):
                 r += 1
             stamp_ns, until_ns, kind, row = end_ns, end_ns, END, 0
             if r < len(views.stamp_ns):
@@ -459,8 +457,7 @@ class FilterShell(ABC):
         if detections is None:
             return NO_STAMPS, NO_VIEWS
         n, stamps_ns = len(detections), detections.stamps_ns
-        ids, refusals = identify(detections, self._minimum_id_probability)
-        outcome = np.array([OPEN if why is None else OUTCOME_NUMBERS[why] for why in refusals], np.int8)
+        ids, outcome = identify(detections, self._minimum_id_probability)
         if stamps_ns[0] < since_ns:
             outcome[stamps_ns < since_ns] = OUTCOME_NUMBERS[Outcome.LATE]
             outcome[stamps_ns < self._reached_ns] = OUTCOME_NUMBERS[Outcome.UNLOCATED]
@@ -534,7 +531,7 @@ class FilterShell(ABC):
         if not self.has_bias:
             C[3:, 3:] += self.calibration.imu.gyro_bias_sigma**2 * D[3:] @ D[3:].T
         if kind in (DEPTH, FRAME):
-            more = 1 if kind == DEPTH else len(open_rows(events.views, row))
+            more = 1 if kind == DEPTH else len(accepted_rows(events.views, row))
             self._in_gap[start_ns, kind] = count = self._in_gap.get((start_ns, kind), 0) + more
             C *= count * (count + 1)
         self._was_lost, events.has_rate[k], events.views.landmark[:] = True, False, -1
@@ -558,7 +555,7 @@ class FilterShell(ABC):
 
     def _see(self, ids: Ints, motion: Motion, views: Views, first: int) -> None:
         """Update by the landmarks of a frame, or append them at first sight."""
-        for row in open_rows(views, first):
+        for row in accepted_rows(views, first):
             landmark_id, z, R_z = int(ids[row]), views.z[row], views.R_z[row]
             if landmark_id not in self._slots:
                 self.augment(motion, z, R_z)

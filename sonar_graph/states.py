@@ -294,10 +294,10 @@ class DetectionJournal:
             landmark_ids=np.array(self._ids, dtype=np.int64),
             innovations=np.array(self._innovations, dtype=np.float64).reshape(n, 2),
             innovation_covs=np.array(self._innovation_covs, dtype=np.float64).reshape(n, 2, 2),
-            outcomes=[_OUTCOMES[number] for number in self._outcomes],
+            outcomes=[OUTCOMES[number] for number in self._outcomes],
         )
 
 
-_OUTCOMES = list(Outcome)
-OUTCOME_NUMBERS = {outcome: number for number, outcome in enumerate(_OUTCOMES)}
+OUTCOMES = list(Outcome)
+OUTCOME_NUMBERS = {outcome: number for number, outcome in enumerate(OUTCOMES)}
 UNKNOWN = (math.nan,) * 4

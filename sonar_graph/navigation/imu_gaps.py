@@ -21,8 +21,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sonar_graph.calibration import HOLE_INTERVALS, ROWS_BEFORE, SHORTEST_HOLE_S, UNTYPICAL_S, ImuCalibration
-from sonar_graph.measurements import Ints
-from sonar_graph.numerics import Vec3, compiled
+from sonar_graph.measurements import Floats, Ints
+from sonar_graph.numerics import Vec3, compiled, vec
 
 UNTYPICAL_NS = round(UNTYPICAL_S * 1e9)
 UNFELT_NS = 100_000_000
@@ -37,10 +37,10 @@ class Turns(NamedTuple):
     """How a vehicle turns unseen in holes of its IMU."""
 
     is_modelled: bool
-    sigma: Vec3
-    """Of the rate about each body axis, rad/s."""
-    time_s: Vec3
-    """Its time."""
+    sigma: Floats
+    """Of the rate about each body axis, shape (3,), rad/s."""
+    time_s: Floats
+    """Its time, shape (3,)."""
     gyro_density: float
     """rad/s/√Hz."""
 
@@ -48,11 +48,11 @@ class Turns(NamedTuple):
 def turns_of(imu: ImuCalibration) -> Turns:
     """The numbers of a calibration."""
     is_modelled = any(sigma > 0 for sigma in imu.turn_sigma_rad_s)
-    return Turns(is_modelled, Vec3(*imu.turn_sigma_rad_s), Vec3(*imu.turn_time_s), imu.gyro_noise_density)
+    return Turns(is_modelled, np.array(imu.turn_sigma_rad_s), np.array(imu.turn_time_s), imu.gyro_noise_density)
 
 
 ONES = Vec3(1.0, 1.0, 1.0)
-UNTURNED = Turns(False, ONES, ONES, 0.0)
+UNTURNED = Turns(False, np.ones(3), np.ones(3), 0.0)
 """With it no interval is a hole."""
 
 
@@ -101,7 +101,7 @@ def error_in_hole(turns: Turns, stamps: Ints, rows: int, row: int, t: int, until
     last, n2 = min(row, rows) - 1, turns.gyro_density**2
     typical_s = typical_ns(stamps, last) * 1e-9
     by_row = n2 / typical_s if typical_s > 0.0 else 0.0
-    s, c = turns.sigma, turns.time_s
+    s, c = vec(turns.sigma), vec(turns.time_s)
     if row < rows:
         T = (stamps[row] - stamps[last]) * 1e-9
         grown = Vec3(closed_variance(s.x, c.x, T), closed_variance(s.y, c.y, T), closed_variance(s.z, c.z, T))

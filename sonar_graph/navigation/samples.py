@@ -32,8 +32,10 @@ class StampedRows:
         n, end = len(self.stamps_ns), len(self.stamps_ns) + len(stamps_ns)
         comes_after = not n or bool(stamps_ns[0] > self.stamps_ns[-1])
         columns = self._columns
-        if end > len(columns[0]):  # room for as many rows again
-            columns = [np.concatenate([old[:n], np.empty((end, *old.shape[1:]), old.dtype)]) for old in columns]
+        if end > len(columns[0]):
+            columns = [np.empty((4 * end, *old.shape[1:]), old.dtype) for old in columns]
+            for column, old in zip(columns, self._columns, strict=True):
+                column[:n] = old[:n]
         for column, new in zip(columns, (stamps_ns, *values), strict=True):
             column[n:end] = new
         self._show(end, *columns)
@@ -51,7 +53,7 @@ class StampedRows:
         """Take columns, of which the first n rows are filled."""
         self._columns = list(columns)
         self.stamps_ns: Ints = columns[0][:n]
-        self.values = tuple(column[:n] for column in columns[1:])
+        self.values = tuple([column[:n] for column in columns[1:]])
 
 
 UNITS_NS = {"seconds": 1_000_000_000, "milliseconds": 1_000_000, "microseconds": 1_000}

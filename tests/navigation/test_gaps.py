@@ -13,7 +13,6 @@ from sonar_graph.measurements import Dvl, Imu, Measurements
 from sonar_graph.navigation import Odometry
 from sonar_graph.navigation.imu_gaps import Turns, closed_variance, error_in_hole, hole_ns, open_variance
 from sonar_graph.navigation.joint_preintegration import JointPreintegrator
-from sonar_graph.numerics.matrices import Vec3
 from sonar_graph.testing import check_consistent
 
 from . import ways
@@ -302,7 +301,7 @@ def test_a_coarse_gyros_rows_beside_a_hole_err_for_all_of_it(until_s, is_modelle
 def test_the_noise_of_rows_goes_by_the_interval_that_is_typical():
     """By hand: density 2, rows 10 ms apart but for one lost, and the third of three steps of an open hole."""
     ns = T0_NS + MS * np.array([0, 10, 20, 30, 50, 60, 70, 80, 90])
-    turns = Turns(True, Vec3(1e-9, 1e-9, 1e-9), Vec3(1.0, 1.0, 1.0), 2.0)
+    turns = Turns(True, np.full(3, 1e-9), np.ones(3), 2.0)
     until_ns = int(ns[-1]) + 300 * MS
     opened = error_in_hole(turns, ns, 9, 9, until_ns - 100 * MS, until_ns)
     assert opened == pytest.approx((4.0 / 0.01 * (0.3**2 - 0.2**2) / 0.1,) * 3)

@@ -10,11 +10,11 @@ from scipy.stats import chi2, multivariate_normal
 
 from sonar_graph.measurements import NO_TRACK, Floats, LandmarkDetections
 from sonar_graph.slam.landmarks import AmendableJournal
-from sonar_graph.slam.landmarks.association import identify
+from sonar_graph.slam.landmarks.association import ACCEPTED, identify
 from sonar_graph.slam.landmarks.joint_compatibility import UNPAIRED, Innovations, Pairing, believed, pair_jointly
 from sonar_graph.slam.landmarks.mixture import LEAST_LANDMARKS, IdentityPosterior, RecogniserErrors
 from sonar_graph.slam.landmarks.tracked import NO_LANDMARK, UNDECIDED, decide, second_rows_of_tracks
-from sonar_graph.states import Outcome
+from sonar_graph.states import OUTCOME_NUMBERS, Outcome
 
 from .made import detected
 
@@ -36,9 +36,9 @@ REPEATED, NO_IDENTITY = Outcome.REPEATED, Outcome.NO_IDENTITY
     ids=["from the threshold on", "however low the threshold", "once a frame, of equals the first"],
 )
 def test_the_most_probable_identity_is_accepted(rows: tuple, least: float, ids: list[int], refusals: list) -> None:
-    found, why = identify(stated(*rows), least)
+    found, outcomes = identify(stated(*rows), least)
     assert found.tolist() == ids
-    assert why == refusals
+    assert outcomes.tolist() == [ACCEPTED if why is None else OUTCOME_NUMBERS[why] for why in refusals]
 
 
 def test_a_row_is_amended_in_its_place_and_loses_its_innovation():

@@ -52,24 +52,28 @@ class GateResult(NamedTuple):
     """True where no row is partial or an outlier."""
 
 
-@compiled
 def gate_velocities(
-    stamps: Ints,
-    velocity: Floats,
-    cov: Floats,
-    known_ns: Ints,
-    known_velocity: Floats,
-    known_cov: Floats,
-    walk: float,
-    gate: float,
-) -> GateResult:
+    stamps: Ints, velocity: Floats, cov: Floats, known_ns: Ints, known_velocity: Floats, known_cov: Floats,
+    walk: float, gate: float,
+) -> GateResult:  # fmt: skip
     """Compare each row with the last whole one accepted, beginning with the known row before the first.
 
     ``walk`` is the root spectral density of the velocity's random walk, m/s/√s; ``gate`` the squared distance beyond
     which a row is an outlier.
     """
-    n, is_plain, last_ns, u, Q_u = len(stamps), True, LATEST_NS, ZERO, O3
-    distance, is_partial, is_outlier = np.zeros(n), np.zeros(n, np.bool_), np.zeros(n, np.bool_)
+    n = len(stamps)
+    out = np.zeros(n), np.zeros(n, np.bool_), np.zeros(n, np.bool_)
+    known = known_ns, known_velocity, known_cov
+    return GateResult(*out, _write_gated(stamps, velocity, cov, *known, walk, gate, *out))
+
+
+@compiled
+def _write_gated(
+    stamps: Ints, velocity: Floats, cov: Floats, known_ns: Ints, known_velocity: Floats, known_cov: Floats,
+    walk: float, gate: float, distance: Floats, is_partial: Flags, is_outlier: Flags,
+) -> bool:  # fmt: skip
+    """Fill the columns of `GateResult`; returns ``is_plain``."""
+    is_plain, last_ns, u, Q_u = True, LATEST_NS, ZERO, O3
     before = rows_until(known_ns, stamps[0] - 1) - 1
     if before >= 0:
         last_ns, u, Q_u = known_ns[before], row_of(known_velocity, before), covariance(known_cov, before)
@@ -82,7 +86,7 @@ def gate_velocities(
             is_plain = False
         else:
             last_ns, u, Q_u = stamps[k], v, Q_v
-    return GateResult(distance, is_partial, is_outlier, is_plain)
+    return is_plain
 
 
 @inlined

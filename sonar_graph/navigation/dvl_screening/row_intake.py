@@ -18,6 +18,7 @@ from sonar_graph.measurements import Dvl, Floats, Imu, Ints
 from sonar_graph.navigation.dvl_screening.dvl_gate import GATE, GateResult, VelocityConfirmation, gate_velocities
 from sonar_graph.navigation.dvl_screening.partial_beams import InertialRows, PartialVelocities, Rows
 from sonar_graph.navigation.samples import EARLIEST_NS, LATEST_NS, StampedRows, in_numbers
+from sonar_graph.numerics import compiled
 from sonar_graph.states import Refusal, RefusedRow
 
 _Rows = TypeVar("_Rows", Imu, Dvl)
@@ -96,7 +97,7 @@ class RowIntake:
         result = self._gated(block)
         if confirmation is None:
             return self._place(block, result)
-        whole_ns = rows.stamps_ns[~(result.is_outlier | result.is_partial)]
+        whole_ns = rows.stamps_ns if result.is_plain else rows.stamps_ns[~(result.is_outlier | result.is_partial)]
         if confirmation.lets_all_pass(rows.stamps_ns, whole_ns):
             confirmation.accept(whole_ns)
             return self._place(block, result)
@@ -131,7 +132,9 @@ class RowIntake:
             known_ns = whole_ns[whole_ns.searchsorted(rows[0])]
         if not len(rows[0]):
             return False
-        was_placed_before = self.dvl.insert(*rows, np.maximum(known_ns, confirmed_ns))
+        if confirmed_ns > EARLIEST_NS:
+            known_ns = np.maximum(known_ns, confirmed_ns)
+        was_placed_before = self.dvl.insert(*rows, known_ns)
         if was_placed_before:  # a row is known no earlier than those before it
             np.maximum.accumulate(self.dvl.values[2], out=self.dvl.values[2])
         return was_placed_before
@@ -146,17 +149,31 @@ class RowIntake:
             if later is None:
                 return None
             rows = later
-        if np.count_nonzero(rows.stamps_ns[1:] == rows.stamps_ns[:-1]):
+        if _repeated(rows.stamps_ns):
             rows = rows.rows(np.unique(rows.stamps_ns, return_index=True)[1])
         return rows
 
 
+@compiled
 def _is_dominant(cov: Floats) -> bool:
     """True where each variance (n, 3, 3) exceeds the rest of its row: then all are finite and positive definite."""
-    return all(
-        abs(xy) + abs(xz) < xx < np.inf and abs(yx) + abs(yz) < yy < np.inf and abs(zx) + abs(zy) < zz < np.inf
-        for xx, xy, xz, yx, yy, yz, zx, zy, zz in cov.reshape(-1, 9).tolist()
-    )
+    for k in range(len(cov)):
+        for i in range(3):
+            variance, rest = cov[k, i, i], 0.0
+            for j in range(3):
+                rest += abs(cov[k, i, j]) if j != i else 0.0
+            if not rest < variance < np.inf:
+                return False
+    return True
+
+
+@compiled
+def _repeated(stamps_ns: Ints) -> int:
+    """Number of rows that have the stamp of the row before."""
+    count = 0
+    for k in range(1, len(stamps_ns)):
+        count += int(stamps_ns[k] == stamps_ns[k - 1])
+    return count
 
 
 def _turned(R: Floats, rows: Floats) -> Floats:

@@ -2,32 +2,50 @@
 
 from functools import cache
 
+import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from sonar_graph.measurements import Ints, LandmarkDetections
-from sonar_graph.states import Outcome
+from sonar_graph.measurements import Floats, Ints, LandmarkDetections
+from sonar_graph.numerics import compiled
+from sonar_graph.states import OUTCOME_NUMBERS, OUTCOMES, Outcome
+
+ACCEPTED = -1
+"""In place of an outcome."""
+NO_IDENTITY, REPEATED = OUTCOME_NUMBERS[Outcome.NO_IDENTITY], OUTCOME_NUMBERS[Outcome.REPEATED]
 
 
-def identify(detections: LandmarkDetections, minimum_probability: float) -> tuple[Ints, list[Outcome | None]]:
-    """Most probable identity of each row, shape (n,), and the reason why it is refused; None where it is accepted.
+def identify(detections: LandmarkDetections, minimum_probability: float) -> tuple[Ints, NDArray[np.int8]]:
+    """Most probable identity of each row, shape (n,), and `ACCEPTED` or the `OUTCOME_NUMBERS` of its refusal, (n,).
 
     Refused is a posterior that is too low or NaN, or of no identity (-1). A landmark is in one place: of several rows
     of one frame with one identity the most probable is accepted, the first of equals.
     """
-    ids, probability = detections.most_probable()
-    rows = zip(detections.stamps_ns.tolist(), ids.tolist(), probability.tolist(), strict=True)
-    refusals: list[Outcome | None] = []
-    best: dict[tuple[int, int], tuple[int, float]] = {}
-    for row, (stamp_ns, landmark_id, p) in enumerate(rows):
-        is_likely = p >= minimum_probability and landmark_id >= 0
-        refusals.append(None if is_likely else Outcome.NO_IDENTITY)
-        if is_likely:
-            other, other_p = best.get((stamp_ns, landmark_id), (row, -1.0))
-            if p > other_p:
-                best[stamp_ns, landmark_id] = row, p
-            if other != row:
-                refusals[other if p > other_p else row] = Outcome.REPEATED
-    return ids, refusals
+    n = len(detections)
+    ids, outcomes = np.empty(n, np.int64), np.empty(n, np.int8)
+    rows = detections.stamps_ns, detections.candidate_ids, detections.id_probability
+    _write_identities(*rows, minimum_probability, ids, outcomes)
+    return ids, outcomes
+
+
+@compiled
+def _write_identities(
+    stamps_ns: Ints, candidates: Ints, posterior: Floats, minimum: float, ids: Ints, outcomes: NDArray[np.int8]
+) -> None:
+    """Fill what `identify` returns."""
+    p = np.empty(len(ids))
+    for row in range(len(ids)):
+        best = 0
+        for k in range(1, candidates.shape[1]):
+            if posterior[row, k] > posterior[row, best]:
+                best = k
+        ids[row], p[row] = candidates[row, best], posterior[row, best]
+        outcomes[row] = ACCEPTED if p[row] >= minimum and ids[row] >= 0 else NO_IDENTITY
+        other = row - 1
+        while other >= 0 and stamps_ns[other] == stamps_ns[row]:
+            if ids[other] == ids[row] and outcomes[other] == ACCEPTED and outcomes[row] == ACCEPTED:
+                outcomes[row if p[row] <= p[other] else other] = REPEATED
+            other -= 1
 
 
 @cache

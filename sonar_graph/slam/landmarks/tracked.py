@@ -17,11 +17,11 @@ from pydantic import Field
 from sonar_graph.calibration import Section
 from sonar_graph.measurements import NO_TRACK, LandmarkDetections
 from sonar_graph.slam.estimates import Solution
-from sonar_graph.slam.landmarks.association import gate_threshold, identify
+from sonar_graph.slam.landmarks.association import ACCEPTED, gate_threshold, identify
 from sonar_graph.slam.landmarks.landmark_graph import Assignment, LandmarkGraph
 from sonar_graph.slam.landmarks.sighting import Screened, SeenFrame, Sighting, beam_point, late_view
 from sonar_graph.slam.landmarks.unknown import IgnoredUnknown, NamelessLandmarks, UnknownParams, unnamed
-from sonar_graph.states import Outcome
+from sonar_graph.states import OUTCOMES, Outcome
 
 UNDECIDED, NO_LANDMARK = -2, -1
 """Decisions of a row besides a landmark's identity."""
@@ -153,10 +153,9 @@ class TrackedIdentities:
             self._nameless.refuse_taken_ids(frame)
             waits |= unnamed(frame)
         kept = [row for row, why in enumerate(refusals) if why is None]
-        if len(kept) == len(frame):
-            return Screened(identify(frame, self._minimum_probability)[1], waits.tolist())
-        for row, why in zip(kept, identify(frame.rows(np.array(kept)), self._minimum_probability)[1], strict=True):
-            refusals[row] = why
+        seen = frame if len(kept) == len(frame) else frame.rows(np.array(kept))
+        for row, number in zip(kept, identify(seen, self._minimum_probability)[1].tolist(), strict=True):
+            refusals[row] = None if number == ACCEPTED else OUTCOMES[number]
         return Screened(refusals, [wait and row in kept for row, wait in enumerate(waits.tolist())])
 
     def assign(self, frame: SeenFrame) -> Iterator[list[Assignment]]:
