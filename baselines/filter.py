@@ -236,19 +236,23 @@ class SonarModel(NamedTuple):
             floor_variance_m2=floor.sigma_m**2 if floor else math.nan,
         )
 
-    def noise_of(self, detections: LandmarkDetections) -> Floats:
-        """Covariances of detections: symmetric, and the calibration's where the log has none, shape (m, 2, 2)."""
-        logged = detections.range_azimuth_cov
-        R_z = 0.5 * (logged + logged.transpose(0, 2, 1))
-        if np.count_nonzero(np.isnan(R_z)):
-            R_z[np.isnan(R_z).any(axis=(1, 2))] = self.R_z
-        return R_z
-
     def elevation_of_new(self, R: Floats, X: Floats, z: Floats) -> float:
         """Elevation of a new landmark seen from a body: on the floor, or 0 without a floor within the aperture."""
         body_T_sonar = gtsam.Pose3(gtsam.Rot3(self.body_R_sonar), self.body_p_sonar)
         world_T_sonar = gtsam.Pose3(gtsam.Rot3(R), X).compose(body_T_sonar)
         return elevation_on_floor(world_T_sonar, z[0], z[1], self.floor_z_m, self.aperture_rad) or 0.0
+
+
+@compiled
+def noise_of(logged: Floats, R_z: Floats) -> Floats:
+    """Covariances of detections (m, 2, 2): symmetric, and R_z where the log has none."""
+    noise = np.empty(logged.shape)
+    for k in range(len(logged)):
+        cross = 0.5 * (logged[k, 0, 1] + logged[k, 1, 0])
+        is_known = not math.isnan(logged[k, 0, 0] + cross + logged[k, 1, 1])
+        noise[k, 0, 0], noise[k, 1, 1] = (logged[k, 0, 0], logged[k, 1, 1]) if is_known else (R_z[0, 0], R_z[1, 1])
+        noise[k, 0, 1] = noise[k, 1, 0] = cross if is_known else R_z[0, 1]
+    return noise
 
 
 def polar_covariance(R_z: Floats, aperture_rad: float) -> Floats:
@@ -464,7 +468,7 @@ class FilterShell(ABC):
         landmark = np.array([-1 if self._was_lost else self._slots.get(i, -1) for i in ids.tolist()])
         z, e, S = np.empty((n, 2)), np.full((n, 2), math.nan), np.full((n, 2, 2), math.nan)
         z[:, 0], z[:, 1] = detections.range_m, detections.azimuth_rad
-        return ids, Views(stamps_ns, landmark, z, self.sonar.noise_of(detections), outcome, e, S)
+        return ids, Views(stamps_ns, landmark, z, noise_of(detections.range_azimuth_cov, self.sonar.R_z), outcome, e, S)
 
     def _use(self, measurements: Measurements, since_ns: int, ids: Ints, views: Views) -> Estimate:
         """Carry the state to the newest epoch reached at the end of the call, with all measurements on the way."""

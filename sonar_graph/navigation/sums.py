@@ -10,7 +10,7 @@ Step k has duration dt, rate w, velocity v of the Doppler log at l in the body, 
 
 A noise of step k reaches the end through the adjoint of the log's pose in the middle of the step; errors kept in frame
 i are not transported from step to step. One adjoint at the end takes both to j: ``C = Ad(j_T_i) C_i Ad(j_T_i)^T``.
-In holes of the IMU N_g has more. Sums can be continued: the number of calls that made them changes no bit.
+In holes of the IMU N has more. Sums can be continued: the number of calls that made them changes no bit.
 docs/theory/preintegration.md.
 """
 
@@ -101,22 +101,25 @@ def _write_motions(
         while t < end:
             until, turn_psd, unfelt = hole_from(rows, imu_rows, dvl_rows, i, k, t, end)
             f += unfelt
+            is_hole = turn_psd @ turn_psd > 0.0
             while t < until:
                 t, dt, rate, v, Q, force = step_from(rows, imu_rows, dvl_rows, i, k, t, until)
                 i += int(i < imu_rows and rows.imu_ns[i] <= t)
                 k += int(k < dvl_rows and rows.dvl_ns[k] <= t)
                 w = rate - b - R.T @ E
                 turn, mean = exp_and_mean(dt * w)
-                R_k, N = R @ mean, n2
-                if turn_psd @ turn_psd > 0.0:
-                    N = n2 + R_k @ diagonal(turn_psd) @ R_k.T
+                R_k = R @ mean
                 s = dt * (R_k @ (v - cross(w, arm)))
-                c = p + 0.5 * s + R_k @ arm
-                cN = skew(c) @ N
-                tt += dt * N
-                rt += dt * cN
-                rr += dt * (R_k @ Q @ R_k.T - cN @ skew(c))
-                D_t, D_r = D_t - dt * R_k, D_r - dt * (skew(c) @ R_k)
+                c = skew(p + 0.5 * s + R_k @ arm)
+                tt += dt * n2
+                rt += dt * (c @ n2)
+                rr += dt * (R_k @ Q @ R_k.T - c @ n2 @ c)
+                if is_hole:
+                    N = R_k @ diagonal(turn_psd) @ R_k.T
+                    tt += dt * N
+                    rt += dt * (c @ N)
+                    rr -= dt * (c @ N @ c)
+                D_t, D_r = D_t - dt * R_k, D_r - dt * (c @ R_k)
                 f += dt * (R_k @ force)
                 p, R = p + s, R @ turn
         store(R, sums, 3 * e, 0)
