@@ -10,12 +10,13 @@ import gtsam
 import numpy as np
 
 from baselines import ekf_equations
-from baselines.ekf_equations import LANDMARK, POSE, correct_depth, observe, predict
+from baselines.ekf_equations import LANDMARK, POSE, correct_depth, correct_up, observe, predict
 from baselines.filter import (
     DEPTH,
     EPOCH,
     FRAME,
     GATED,
+    GRAVITY,
     NO_BIAS,
     USED,
     Events,
@@ -25,6 +26,7 @@ from baselines.filter import (
     SonarModel,
     add_force,
     corrected,
+    up_at_end,
 )
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
 from sonar_graph.errors import EstimatorError
@@ -53,6 +55,10 @@ def advance(
         if kind == EPOCH:
             predict(x, P, dR[k], dp[k], C[k])
             add_force(i_R_j, impulse, dR[k], force[k])
+        elif kind == GRAVITY:
+            up = up_at_end(i_R_j, impulse, events.gravity[row])
+            if not math.isnan(up[0]):
+                correct_up(x, P, up, events.gravity[row, 7])
         elif kind == DEPTH:
             correct_depth(x, P, dR[k], dp[k], C[k], port, events.z_m[row], events.variance_m2[row])
         elif kind == FRAME:
@@ -133,10 +139,6 @@ class EkfSlam(FilterShell):
                 " angles of its state are singular; use isam2 for this log"
             )
         return k
-
-    def correct_up(self, up: Floats, sigma: float) -> None:
-        """Update roll and pitch by the world's up in the body."""
-        ekf_equations.correct_up(self._x, self._P, up, sigma)
 
     def correct_plane(self, plane: PlanarMotion) -> None:
         """Update Z, roll and pitch."""

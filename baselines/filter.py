@@ -29,7 +29,7 @@ from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats, Ints, LandmarkDetections, Measurements
 from sonar_graph.motion import Motions, MotionSource, require_source
 from sonar_graph.navigation.alignment import earth_rate_in_world, tilt_sigma, up_direction
-from sonar_graph.numerics import compiled, cross, exp_and_mean, mat, store, vec
+from sonar_graph.numerics import I3, ZERO, compiled, cross, exp_and_mean, mat, store, vec
 from sonar_graph.slam.landmarks import ACCEPTED, gate_threshold, identify
 from sonar_graph.slam.models import elevation_on_floor
 from sonar_graph.states import (
@@ -90,6 +90,18 @@ def add_force(i_R_j: Floats, impulse: Floats, dR: Floats, more: Floats) -> None:
     store(R @ mat(dR), i_R_j, 0, 0)
 
 
+@compiled
+def up_at_end(i_R_j: Floats, impulse: Floats, interval: Floats) -> Floats:
+    """World's up in the body where an interval of `Events.gravity` ends; NaN if not measured. The next one begins."""
+    duration_s = interval[6]
+    for i in range(3):
+        impulse[i] /= duration_s
+    up = up_direction(impulse, i_R_j, interval[:3], interval[3:6], duration_s)
+    store(I3, i_R_j, 0, 0)
+    impulse[0], impulse[1], impulse[2] = ZERO
+    return up
+
+
 EPOCH, PLANE, GRAVITY, DEPTH, FRAME, END = range(6)
 """Kinds of events; at equal stamps the lower comes first, but plane and gravity right after their epoch."""
 USED, GATED, NEW = (OUTCOME_NUMBERS[outcome] for outcome in (Outcome.USED, Outcome.GATED, Outcome.NEW))
@@ -126,7 +138,7 @@ class Events(NamedTuple):
     end_ns: Ints
     kind: Ints
     row: Ints
-    """Number of the depth sample, or of the first detection of the frame."""
+    """Number of the depth sample, interval of gravity, or first detection of the frame."""
     motions: Motions
     """All NaN over a gap, until that is bridged."""
     has_rate: NDArray[np.bool_]
@@ -134,6 +146,8 @@ class Events(NamedTuple):
     z_m: Floats
     """Depth samples, with their variances; then the detections."""
     variance_m2: Floats
+    gravity: Floats
+    """Intervals of gravity: velocity of the IMU's point at both ends, duration, and sigma of the tilt, shape (g, 8)."""
     views: Views
 
 
@@ -151,12 +165,12 @@ def in_order(
     node_ns, opened_ns, interval_ns
         Epochs of the state and at which the interval of gravity began, and its least length; 0: no gravity.
     """
-    n, e, d, r, kind, stamp_ns, frame_ns = 0, 0, 0, 0, END, LONG_AGO, LONG_AGO
+    n, e, d, r, g, kind, stamp_ns, frame_ns = 0, 0, 0, 0, 0, END, LONG_AGO, LONG_AGO
     while n == 0 or kind != END:
         if kind == EPOCH and is_planar:
             kind, until_ns = PLANE, node_ns
         elif kind <= PLANE and 0 < interval_ns <= node_ns - opened_ns:
-            kind, until_ns, opened_ns = GRAVITY, node_ns, node_ns
+            kind, until_ns, opened_ns, row, g = GRAVITY, node_ns, node_ns, g, g + 1
         else:
             while d < len(depth_ns) and depth_ns[d] < since_ns:
                 d += 1
@@ -339,14 +353,10 @@ class FilterShell(ABC):
 
     @abstractmethod
     def advance(self, events: Events, k: int) -> int:
-        """Predict over epochs, continue the interval of gravity (`add_force`) and correct by depth, from event k on.
+        """Predict over epochs and continue the interval of gravity (`add_force`), correct by gravity and depth.
 
-        Stops at an event over a gap or of another kind, and returns its number; frames may be used and `Views` filled.
+        From event k to one over a gap or of another kind, whose number is returned; frames may be used, `Views` filled.
         """
-
-    @abstractmethod
-    def correct_up(self, up: Floats, sigma: float) -> None:
-        """Update by the world's up in the body, shape (3,), with the sigma of its tilt, rad."""
 
     @abstractmethod
     def correct_plane(self, plane: PlanarMotion) -> None:
@@ -477,8 +487,6 @@ class FilterShell(ABC):
         while kinds[k] != END:
             if kinds[k] == PLANE and self._plane is not None:
                 self.correct_plane(self._plane)
-            elif kinds[k] == GRAVITY:
-                self._use_gravity(int(events.end_ns[k]))
             else:
                 if is_over_gap[k]:
                     self._bridge(events, k)
@@ -513,8 +521,15 @@ class FilterShell(ABC):
         )  # fmt: skip
         stamp_ns, start_ns, until_ns, kind, row = columns[:, :n]
         motions = self.odometry.motions(start_ns, until_ns, stamp_ns, NO_BIAS)
-        has_rate = np.full(n, self._has_rate)
-        return Events(stamp_ns, start_ns, until_ns, kind, row, motions, has_rate, z_m, variance_m2, views)
+        gravity = []
+        for epoch_ns in until_ns[kind == GRAVITY].tolist():
+            duration_s, (velocity_i, variance_i) = (epoch_ns - self._opened_ns) * 1e-9, self._opened_velocity
+            velocity_j, variance_j = self._opened_velocity = self.odometry.velocity_at_imu(epoch_ns)
+            sigma = tilt_sigma(duration_s, math.sqrt(0.5 * (variance_i + variance_j)), self.calibration)
+            gravity.append((*velocity_i.tolist(), *velocity_j.tolist(), duration_s, sigma))
+            self._opened_ns = epoch_ns
+        intervals, has_rate = np.array(gravity).reshape(-1, 8), np.full(n, self._has_rate)
+        return Events(stamp_ns, start_ns, until_ns, kind, row, motions, has_rate, z_m, variance_m2, intervals, views)
 
     def motion_to(self, events: Events, k: int) -> Motion:
         """Motion to an event, without the gyro bias of the state and the Earth's rate."""
@@ -544,18 +559,6 @@ class FilterShell(ABC):
             events.motions, (pose.rotation().matrix(), pose.translation(), C, D, impulse), strict=True
         ):
             column[k] = value
-
-    def _use_gravity(self, epoch_ns: int) -> None:
-        """Update by the direction of gravity over the interval that ends at an epoch."""
-        duration_s, (velocity_i, variance_i) = (epoch_ns - self._opened_ns) * 1e-9, self._opened_velocity
-        velocity_j, variance_j = self.odometry.velocity_at_imu(epoch_ns)
-        up = up_direction(self.impulse / duration_s, self.turned, velocity_i, velocity_j, duration_s)
-        velocity_sigma = math.sqrt(0.5 * (variance_i + variance_j))
-        sigma = tilt_sigma(duration_s, velocity_sigma, self.calibration)
-        if math.isfinite(up[0]):
-            self.correct_up(up, sigma)
-        self._opened_ns, self._opened_velocity = epoch_ns, (velocity_j, variance_j)
-        self.turned, self.impulse = np.eye(3), np.zeros(3)
 
     def _see(self, ids: Ints, motion: Motion, views: Views, first: int) -> None:
         """Update by the landmarks of a frame, or append them at first sight."""

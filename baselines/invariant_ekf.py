@@ -11,6 +11,7 @@ from baselines import invariant_equations as equations
 from baselines.filter import (
     DEPTH,
     EPOCH,
+    GRAVITY,
     Events,
     FilterParams,
     FilterShell,
@@ -19,6 +20,7 @@ from baselines.filter import (
     far_view,
     is_inside,
     polar_covariance,
+    up_at_end,
 )  # fmt: skip
 from baselines.invariant_equations import BARE, BETA, BODY, EYE, THETA, UP, InvariantState
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
@@ -87,9 +89,13 @@ class InvariantEkf(FilterShell):
 
     def advance(self, events: Events, k: int) -> int:
         """Predict over epochs and correct by depth, from event k on."""
-        while events.kind[k] in (EPOCH, DEPTH) and not np.isnan(events.motions.dp[k, 0]):
+        while events.kind[k] in (EPOCH, GRAVITY, DEPTH) and not np.isnan(events.motions.dp[k, 0]):
             motion, row = self.motion_to(events, k), events.row[k]
-            if events.kind[k] == EPOCH:
+            if events.kind[k] == GRAVITY:
+                up = up_at_end(self.turned, self.impulse, events.gravity[row])
+                if not np.isnan(up[0]):
+                    self.correct_up(up, events.gravity[row, 7])
+            elif events.kind[k] == EPOCH:
                 self.predict(motion, (events.end_ns[k] - events.start_ns[k]) * 1e-9)
                 add_force(self.turned, self.impulse, motion.dR, motion.impulse)
             else:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from baselines.ekf_slam import EkfSlam
-from baselines.filter import DEPTH, END, EPOCH, NO_VIEWS, Events, FilterShell, Motion
+from baselines.filter import DEPTH, END, EPOCH, GRAVITY, NO_VIEWS, Events, FilterShell, Motion
 from baselines.invariant_ekf import InvariantEkf
 from baselines.invariant_equations import InvariantState
 from sonar_graph.calibration import Calibration, DepthCalibration, Mounting, SonarCalibration
@@ -69,6 +69,9 @@ def motion_of(twist: Floats, C: Floats = MOTION_COV, D: Floats = D_BIAS) -> Moti
     return Motion(rotation(twist[:3]), np.array(twist[3:]), C, D, np.full(3, np.nan))
 
 
+STILL = motion_of(np.zeros(6), np.zeros((6, 6)))
+
+
 def pose_after(world: World, motion: Motion, eps: Floats = NOTHING) -> gtsam.Pose3:
     """True pose after a motion perturbed by [theta, rho] in its last frame, to which the bias adds."""
     eps = eps + motion.D @ (world.bias - BIAS)
@@ -85,11 +88,14 @@ def carried(world: World, motion: Motion, eps: Floats = NOTHING) -> World:
     return world._replace(R=pose.rotation().matrix(), X=pose.translation())
 
 
-def one_event(kind: int, motion: Motion, duration_s: float, z_m: float = 0.0, variance_m2: float = 0.0) -> Events:
-    """An event at the end of a motion without bias and Earth's rate, and the end of the call."""
+def one_event(kind: int, motion: Motion, duration_s: float, numbers: Any = (0.0, 0.0)) -> Events:
+    """An event at the end of a motion without bias and Earth's rate, and the end of the call.
+
+    ``numbers``: height and its variance, or those of an interval of gravity.
+    """
     stamps = np.array([[0, 0], [0, 0], [round(duration_s * NS_PER_S)] * 2, [kind, END], [0, 0]], np.int64)
-    motions = Motions(*(np.array([part, part]) for part in motion))
-    return Events(*stamps, motions, np.zeros(2, bool), np.array([z_m]), np.array([variance_m2]), NO_VIEWS)
+    motions, values = Motions(*(np.array([part, part]) for part in motion)), np.array([numbers], float)
+    return Events(*stamps, motions, np.zeros(2, bool), *values.T[:2].copy(), values, NO_VIEWS)
 
 
 def predict(slam: FilterShell, motion: Motion, duration_s: float = 1.0) -> None:
@@ -97,7 +103,12 @@ def predict(slam: FilterShell, motion: Motion, duration_s: float = 1.0) -> None:
 
 
 def correct_depth(slam: FilterShell, motion: Motion, z_m: float, variance_m2: float) -> None:
-    assert slam.advance(one_event(DEPTH, motion, 1.0, z_m, variance_m2), 0) == 1
+    assert slam.advance(one_event(DEPTH, motion, 1.0, (z_m, variance_m2)), 0) == 1
+
+
+def correct_up(slam: FilterShell, up: Floats, sigma: float) -> None:
+    slam.impulse[:] = 9.8 * up
+    assert slam.advance(one_event(GRAVITY, STILL, 0.0, (*np.zeros(6), 1.0, sigma)), 0) == 1
 
 
 def random_covariance(n: int, scale: float = 0.03, seed: int = 0) -> Floats:

@@ -28,6 +28,7 @@ from .filters import (
     both,
     carried,
     correct_depth,
+    correct_up,
     motion_of,
     pose_after,
     predict,
@@ -169,7 +170,7 @@ def test_depth_up_and_plane_are_scalar_kalman_updates_where_nothing_correlates(f
     assert variances[5] == pytest.approx(1 / (1 / z + 1 / 0.05))
     assert X[2] == pytest.approx(0.01 * z / (z + 0.05))
     # the body's y axis points up by a milliradian: roll
-    rpy, _, variances = after(lambda slam: slam.correct_up(np.array([0.0, 0.001, 1.0]), np.sqrt(0.05)))
+    rpy, _, variances = after(lambda slam: correct_up(slam, np.array([0.0, 0.001, 1.0]), np.sqrt(0.05)))
     assert_allclose(variances[:2], [1 / (1 / roll + 20), 1 / (1 / pitch + 20)], rtol=1e-5)
     assert rpy[0] == pytest.approx(0.001 * roll / (roll + 0.05), rel=1e-3)
     plane = PlanarMotion(z_m=0.02, z_sigma_m=np.sqrt(0.05), tilt_sigma_rad=0.1)

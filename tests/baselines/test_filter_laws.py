@@ -362,7 +362,7 @@ def test_events_come_in_the_order_of_their_stamps_each_with_its_motion_from_the_
 
     expected = [
         (10, 5, 10, DEPTH, 1), (18, 5, 18, FRAME, 0), (20, 5, 19, EPOCH, 0), (20, 19, 20, DEPTH, 2),
-        (20, 19, 20, FRAME, 1), (40, 19, 39, EPOCH, 1), (40, 39, 39, GRAVITY, 1), (45, 39, 45, FRAME, 4),
+        (20, 19, 20, FRAME, 1), (40, 19, 39, EPOCH, 1), (40, 39, 39, GRAVITY, 0), (45, 39, 45, FRAME, 4),
         (50, 39, 50, DEPTH, 3), (58, 39, 57, EPOCH, 2), (60, 57, 60, END, 0),
     ]  # fmt: skip
     assert events(34) == expected

@@ -8,9 +8,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from baselines.filter import SonarModel, far_view, is_inside
+from baselines.filter import SonarModel, far_view, is_inside, noise_of
 from sonar_graph.calibration import FloorPrior, SonarCalibration
-from sonar_graph.measurements import NS_PER_S, LandmarkDetections
+from sonar_graph.measurements import NS_PER_S
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
@@ -24,6 +24,7 @@ from .filters import (
     CALIBRATION,
     MOTION_SIGMA,
     NOISE,
+    STILL,
     TWIST,
     World,
     begun,
@@ -175,13 +176,12 @@ def test_the_innovation_of_azimuth_wraps_around(filter_):
 def test_noise_is_the_log_s_made_symmetric_and_where_it_has_a_hole_the_calibration_s(hole):
     logged = np.array([[[4e-4, 3e-5], [1e-5, 1e-4]]] * 2)
     logged[(1, *hole)] = math.nan
-    rows = LandmarkDetections(np.zeros(2, int), np.ones(2), np.ones(2), logged, np.ones((2, 1), int), np.ones((2, 1)))
-    assert_allclose(SonarModel.of(CALIBRATION, 0.999).noise_of(rows), [[[4e-4, 2e-5], [2e-5, 1e-4]], NOISE])
+    assert_allclose(noise_of(logged, NOISE), [[[4e-4, 2e-5], [2e-5, 1e-4]], NOISE])
 
 
 # ---------------------------------------------------------------------------------------------- views from far away
 
-FAR_LANDMARK, APERTURE_RAD, STILL = np.array([25.0, 12.0, -1.0]), 0.3, motion_of(np.zeros(6), np.zeros((6, 6)))
+FAR_LANDMARK, APERTURE_RAD = np.array([25.0, 12.0, -1.0]), 0.3
 AHEAD = CALIBRATION.model_copy(update={"sonar": SonarCalibration(elevation_aperture_rad=APERTURE_RAD)})
 """A sonar at the origin of the body."""
 

@@ -8,7 +8,7 @@ from scipy.stats import chi2
 
 from sonar_graph.measurements import Floats, Ints, LandmarkDetections
 from sonar_graph.numerics import compiled
-from sonar_graph.states import OUTCOME_NUMBERS, OUTCOMES, Outcome
+from sonar_graph.states import OUTCOME_NUMBERS, Outcome
 
 ACCEPTED = -1
 """In place of an outcome."""
