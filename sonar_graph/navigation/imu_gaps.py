@@ -34,7 +34,7 @@ SHORT = 0.03
 
 
 class Turns(NamedTuple):
-    """How a vehicle turns unseen in holes of its IMU."""
+    """Model of the turns of a vehicle unseen in holes of its IMU."""
 
     is_modelled: bool
     sigma: Floats

@@ -59,7 +59,7 @@ class Step(NamedTuple):
     """Specific force at the IMU, m/s²; NaN where not measured."""
 
 
-class Hole(NamedTuple):
+class ImuHole(NamedTuple):
     """A hole of the IMU, or a stretch without one."""
 
     until_ns: int
@@ -70,14 +70,14 @@ class Hole(NamedTuple):
 
 
 @compiled
-def hole_from(rows: Rows, imu_rows: int, dvl_rows: int, i: int, k: int, t: int, end_ns: int) -> Hole:
+def hole_from(rows: Rows, imu_rows: int, dvl_rows: int, i: int, k: int, t: int, end_ns: int) -> ImuHole:
     """The hole at t, of which i and k are the first rows after it, to its end (open: to the next stamp), or none.
 
     It stands outside of the loop over steps, which takes half as long without calls.
     """
     imu_ns, until = rows.imu_ns, end_ns
     if not rows.turns.is_modelled:
-        return Hole(end_ns, ZERO, ZERO)
+        return ImuHole(end_ns, ZERO, ZERO)
     if i < imu_rows:
         until = min(until, imu_ns[i])
     elif k < dvl_rows:
@@ -85,10 +85,10 @@ def hole_from(rows: Rows, imu_rows: int, dvl_rows: int, i: int, k: int, t: int, 
     length_ns = hole_ns(imu_ns, imu_rows, i, until)
     if length_ns > 0:
         unfelt = Vec3(np.nan, np.nan, np.nan) if length_ns > UNFELT_NS else ZERO
-        return Hole(until, error_in_hole(rows.turns, imu_ns, imu_rows, i, t, until), unfelt)
+        return ImuHole(until, error_in_hole(rows.turns, imu_ns, imu_rows, i, t, until), unfelt)
     while i + 1 < imu_rows and imu_ns[i] < end_ns and imu_ns[i + 1] - imu_ns[i] <= SHORTEST_NS:
         i += 1
-    return Hole(min(end_ns, imu_ns[i]) if i < imu_rows else until, ZERO, ZERO)
+    return ImuHole(min(end_ns, imu_ns[i]) if i < imu_rows else until, ZERO, ZERO)
 
 
 @inlined
