@@ -82,7 +82,8 @@ class DeadReckoning:
         if epoch_ns is None or end_ns < epoch_ns:
             return None
         for reached_ns in self._odometry.epochs(epoch_ns, end_ns).tolist():
-            self._pose, self._P = self._after(self._odometry.motion(epoch_ns, reached_ns, ZERO_BIAS, self._attitude()))
+            motion = self._odometry.motion(epoch_ns, reached_ns, ZERO_BIAS, self._attitude(), known_ns=end_ns)
+            self._pose, self._P = self._after(motion)
             epoch_ns = reached_ns
         self._odometry.forget_before(epoch_ns)
         self._epoch_ns = epoch_ns

@@ -129,8 +129,8 @@ class MotionSource(Protocol):
         """Motion from one instant to another, over gaps too, without the gyro bias (body axes, shape (3,), rad/s).
 
         The attitude ``world_R_i`` at the start, shape (3, 3), serves to remove the Earth's rotation where the
-        calibration says so; None: it is not removed. Rows stamped after ``known_ns`` are not used; None: ``end_ns``, or
-        the instant at which it is reached if it is an epoch.
+        calibration says so; None: it is not removed. Rows stamped after ``known_ns``, by default ``end_ns``, are not
+        used: to an epoch it is final only if that is an instant at which the epoch is reached.
         """
 
     def motions(self, start_ns: Ints, end_ns: Ints, known_ns: Ints, bias: Floats) -> Motions:

@@ -98,7 +98,7 @@ class PlainIsam2:
         self._graph.push_back(factors.start_prior(X(0), self._calibration))
 
     def _add_pose(self, node_ns: int, measurements: Measurements) -> None:
-        motion = self._odometry.motion(self._node_ns, node_ns, NO_BIAS)
+        motion = self._odometry.motion(self._node_ns, node_ns, NO_BIAS, known_ns=measurements.end_ns)
         self._pose = self._pose.compose(motion.i_T_j)
         self._graph.push_back(self._odometry_factor(motion))
         self._index += 1

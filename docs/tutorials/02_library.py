@@ -23,12 +23,12 @@ calibration = sequence.calibration
 print(f"IMU: angular velocity {sequence.imu.angular_velocity.shape} rad/s, from {sequence.imu.stamps_ns[0]} ns")
 
 # 2. Preintegration between two instants. Gyro and Doppler rows are merged into steps, the steps into one motion with
-# one joint covariance. Between epochs, the stamps of the Doppler log, a motion is final.
+# one joint covariance. Between epochs, the stamps of the Doppler log, a motion is final once rows after them are known.
 odometry = Odometry(calibration)
 odometry.add(sequence.imu, sequence.dvl)
 epochs = odometry.epochs(sequence.start_ns, sequence.end_ns)
 start_ns, end_ns = int(epochs[70]), int(epochs[140])
-motion = odometry.motion(start_ns, end_ns, bias=np.zeros(3))
+motion = odometry.motion(start_ns, end_ns, bias=np.zeros(3), known_ns=sequence.end_ns)
 moved_m = np.linalg.norm(motion.i_T_j.translation())
 sigmas = np.sqrt(np.diag(motion.covariance))
 print(f"\nin {motion.duration_s:.2f} s: {moved_m:.3f} m")
@@ -53,7 +53,7 @@ pose = calibration.start.pose()
 graph.push_back(factors.start_prior(X(0), calibration))
 values.insert(X(0), pose)
 for index, (before_ns, after_ns) in enumerate([(int(epochs[0]), start_ns), (start_ns, end_ns)]):
-    step = odometry.motion(before_ns, after_ns, bias=np.zeros(3))
+    step = odometry.motion(before_ns, after_ns, bias=np.zeros(3), known_ns=sequence.end_ns)
     pose = pose.compose(step.i_T_j)
     graph.push_back(factors.odometry(X(index), X(index + 1), step))
     values.insert(X(index + 1), pose)

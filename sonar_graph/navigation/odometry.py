@@ -149,10 +149,10 @@ class Odometry:
     def motion(
         self, start_ns: int, end_ns: int, bias: Floats, world_R_i: Floats | None = None, known_ns: int | None = None
     ) -> PreintegratedMotion:
-        """Motion from one instant to another, over gaps too, from rows known at an instant, the first at any.
+        """Motion from one instant to another, over gaps too, from rows known at ``known_ns``, by default the second.
 
-        The part up to the newest epoch is final and kept: the same start and bias, asked for later and later instants,
-        cost what is new.
+        To an epoch, name an instant at which it is reached. The part up to the newest epoch is final and kept: the same
+        start and bias, asked for later and later instants, cost what is new.
 
         Raises
         ------
@@ -167,10 +167,7 @@ class Odometry:
             raise MeasurementError(f"interval: ends at {end_ns} ns, before its start {start_ns}; the earlier first")
         if start_ns < (first_ns := max(imu_ns[0], dvl_ns[0])):
             raise MeasurementError(f"start_ns: {start_ns} lies before the rows; begin at {first_ns} or later")
-        if known_ns is None:
-            known_ns = end_ns
-            if end_ns <= imu_ns[-1] and self._is_doppler_stamp(end_ns):
-                known_ns = int(self.reached_ns(np.array([end_ns]))[0])
+        known_ns = end_ns if known_ns is None else known_ns
         noise = bias, ZERO if self._earth is None or world_R_i is None else world_R_i.T @ self._earth
         before_ns = self.epochs(dvl_ns[0] - 1, min(end_ns, known_ns))
         if len(before_ns) and before_ns[-1] < start_ns < end_ns and self.is_gap(int(before_ns[-1]), end_ns):
@@ -186,7 +183,7 @@ class Odometry:
 
     def velocity_at_imu(self, epoch_ns: int) -> tuple[Floats, float]:
         """Velocity of the IMU's point at an epoch, body axes, shape (3,), m/s, and the variance of one component."""
-        if not self._is_doppler_stamp(epoch_ns):
+        if epoch_ns not in self._dvl.stamps_ns:
             raise no_doppler_stamp("epoch_ns", epoch_ns, self._dvl.stamps_ns)
         k, i = (int(stamps.searchsorted(epoch_ns)) for stamps in (self._dvl.stamps_ns, self._imu.stamps_ns))
         (velocity, cov, _), (rates, _), imu_ns = self._dvl.values, self._imu.values, self._imu.stamps_ns
@@ -201,10 +198,6 @@ class Odometry:
         (rate, force), (velocity, cov, known_ns) = self._imu.values, self._dvl.values
         imu_ns, dvl_ns = self._imu.stamps_ns, self._dvl.stamps_ns
         return Rows(imu_ns, rate, force, dvl_ns, velocity, cov, known_ns, self._hold_past, self._turns)
-
-    def _is_doppler_stamp(self, instant_ns: int) -> bool:
-        k = self._dvl.stamps_ns.searchsorted(instant_ns)
-        return bool(k < len(self._dvl.stamps_ns) and self._dvl.stamps_ns[k] == instant_ns)
 
     def _since(self, start_ns: int, end_ns: int, known_ns: int, bias: Floats, earth: Floats) -> PreintegratedMotion:
         """Motion from an instant: final to the newest epoch, provisional from there on.

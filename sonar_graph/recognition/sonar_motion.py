@@ -32,8 +32,9 @@ class _Tilt:
         for epoch_ns in self._odometry.epochs(self.epoch_ns + GRAVITY_INTERVAL_NS - 1, instant_ns).tolist():
             if epoch_ns - self.epoch_ns < GRAVITY_INTERVAL_NS:
                 continue
-            motion = self._odometry.motion(self.epoch_ns, epoch_ns, _NO_BIAS)
-            measured = self._gravity(motion, epoch_ns) if self._calibration.use_gravity else None
+            motion = self._odometry.motion(self.epoch_ns, epoch_ns, _NO_BIAS, known_ns=instant_ns)
+            began_at_epoch = self.epoch_ns in self._odometry.epochs(self.epoch_ns - 1, instant_ns)
+            measured = self._gravity(motion, epoch_ns) if self._calibration.use_gravity and began_at_epoch else None
             self.up, self.variance = self.after(motion)
             if measured is not None:
                 direction, sigma = measured

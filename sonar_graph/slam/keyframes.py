@@ -171,7 +171,7 @@ class Keyframes:
             self._linearise()
         interval_ns = round(self.params.max_interval_s / S_PER_NS)
         while len(due_ns := self.odometry.epochs(self.stamps_ns[-1] + interval_ns - 1, until_ns)):
-            self._set(int(due_ns[0]))
+            self._set(int(due_ns[0]), until_ns)
             changes.append(self.smoother.update(self.newest_s))
             self._linearise()
         return changes
@@ -185,7 +185,7 @@ class Keyframes:
             variances = (motion.covariance.diagonal() + bias_sigma**2 * (motion.D_bias**2).sum(axis=1)).tolist()
             share = max(variances[:3]) / sonar.azimuth_sigma_rad**2, max(variances[3:]) / sonar.range_sigma_m**2
             if max(share) > self.params.motion_noise_share:
-                self._set(node_ns)
+                self._set(node_ns, stamp_ns)
                 self._linearise()
                 motion = self.motion_since_newest(stamp_ns)
         if not self.odometry.is_gap(node_ns or self.stamps_ns[-1], stamp_ns):
@@ -225,10 +225,11 @@ class Keyframes:
         """world_R_body at the newest keyframe."""
         return self.smoother.values.atPose3(self.newest_key).rotation().matrix()
 
-    def _set(self, node_ns: int) -> None:
+    def _set(self, node_ns: int, known_ns: int) -> None:
+        """Set a keyframe at an epoch that is reached at an instant."""
         i, j = len(self.stamps_ns) - 1, len(self.stamps_ns)
         start_ns, bias, attitude = self.stamps_ns[-1], self.bias(i), self._attitude()
-        motion = self.odometry.motion(start_ns, node_ns, bias, attitude)
+        motion = self.odometry.motion(start_ns, node_ns, bias, attitude, known_ns)
         self.smoother.add_pose(X(j), self.smoother.values.atPose3(X(i)).compose(motion.i_T_j), node_ns * S_PER_NS)
         if self._estimates_bias:
             between = factors.odometry_with_bias(X(i), X(j), self.bias_keys[i], motion)
@@ -236,7 +237,7 @@ class Keyframes:
             between = factors.odometry(X(i), X(j), motion)
         self.smoother.add({"odometry": between})
         self._add_gravity(j, node_ns, motion)
-        self._add_depth(j, start_ns, node_ns, bias)
+        self._add_depth(j, start_ns, node_ns, known_ns, bias)
         self.bias_keys.append(self._next_bias_key(i, node_ns))
         self.stamps_ns.append(node_ns)
         self._constrain(j)
@@ -251,7 +252,7 @@ class Keyframes:
         if up:
             self.smoother.add({"gravity": factors.gravity_direction(X(j), *up)})
 
-    def _add_depth(self, j: int, start_ns: int, node_ns: int, bias: Floats) -> None:
+    def _add_depth(self, j: int, start_ns: int, node_ns: int, known_ns: int, bias: Floats) -> None:
         """One factor for the samples since the last keyframe, carried to this one by odometry and averaged there.
 
         Samples are carried over no gap of the Doppler log. The port at sample k lies at ``k_T_j^-1 port`` in frame j.
@@ -266,9 +267,8 @@ class Keyframes:
         found_ns = [b for a, b in pairwise(epochs_ns) if self.odometry.is_gap(a, b)]
         after_ns = found_ns[-1] - CARRIED_IN_GAP_NS if found_ns else start_ns
         first, end = stamps_ns.searchsorted([after_ns, node_ns], side="right").tolist()
-        known_ns = np.full(end - first, self.odometry.reached_ns(np.array([node_ns]))[0])
         until_ns = np.append(stamps_ns[first + 1 : end], node_ns)[: end - first]
-        motions = self.odometry.motions(stamps_ns[first:end], until_ns, known_ns, bias)
+        motions = self.odometry.motions(stamps_ns[first:end], until_ns, np.full(end - first, known_ns), bias)
         lost = np.flatnonzero(np.isnan(motions.dp[:, 0]))  # a gap shorter than what samples are carried over
         kept = int(lost[-1]) + 1 if len(lost) else 0
         if kept == end - first:

@@ -177,4 +177,5 @@ def motion(imu, dvl, known, start_s, until_s, bias=(0.0, 0.0, 0.0), earth=None):
     odometry = Odometry(known)
     odometry.add(imu, dvl)
     odometry._earth = earth
-    return odometry.motion(at(start_s), at(until_s), np.array(bias), np.eye(3))
+    known_ns = int(imu.stamps_ns[-1]) if at(until_s) in dvl.stamps_ns else at(until_s)
+    return odometry.motion(at(start_s), at(until_s), np.array(bias), np.eye(3), known_ns)

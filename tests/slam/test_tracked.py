@@ -161,14 +161,17 @@ def answers(policy: str, seed: int | None, source: type[Odometry] = Odometry) ->
     """At tens of seconds, of identities that are late, wrong and missing.
 
     Calls every ten seconds, and asked only at the end; with a seed also calls a quarter to two seconds apart, of which
-    every eighth asks. Calls at quarters of a second fall on epochs and frames too.
+    every eighth asks, and at every third frame. Frames fall on epochs, between rows of the IMU.
     """
     sequence = simulate_basin(BasinOptions(**BASIN, **TROUBLES["late and wrong"], anonymous_share=0.3))
+    frames_ns, dvl_ns = np.unique(sequence.detections.stamps_ns), sequence.dvl.stamps_ns.copy()
+    dvl_ns[dvl_ns.searchsorted(frames_ns)] = frames_ns
+    sequence = replace(sequence, dvl=replace(sequence.dvl, stamps_ns=dvl_ns))
     instants = tens = sequence.instants(SELDOM_HZ)
     if seed is not None:
         quarters = np.random.default_rng(seed).integers(1, 9, 1000)
         between = tens[0] + np.cumsum(quarters) * NS // 4
-        instants = np.union1d(tens, between[between < tens[-1]])
+        instants = np.union1d(tens, np.append(between[between < tens[-1]], frames_ns[::3]))
     made = laws.run(
         lambda calibration, _: Isam2(calibration, source(calibration), isam2_params(**CUT[policy])),
         sequence, instants, ask_every=0 if seed is None else 8,

@@ -126,7 +126,8 @@ def lost_in_gaps(sequence, calibration, gap_s=30):
         for kept in (slice(None), np.r_[: first + 1, first + gap_s - WAITING : len(dvl)]):
             odometry, rows = Odometry(calibration), dvl.rows(kept)
             odometry.add(sequence.imu, rows)
-            displacements.append(odometry.motion(*ends, np.zeros(3), attitude(ends[0]).as_matrix()).i_T_j)
+            known = attitude(ends[0]).as_matrix(), sequence.end_ns
+            displacements.append(odometry.motion(*ends, np.zeros(3), *known).i_T_j)
         lost.append(displacements[0].translation() - displacements[1].translation())
     return np.sqrt(np.mean(np.sum(np.square(lost), axis=1)))
 
