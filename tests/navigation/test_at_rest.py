@@ -9,10 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
+from baselines.invariant_ekf import InvariantEkf
+from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting, Start
 from sonar_graph.errors import AlignmentError
-from sonar_graph.measurements import Dvl, Floats, Imu
-from sonar_graph.navigation import PreintegratedMotion
+from sonar_graph.measurements import Dvl, Floats, Imu, Measurements
+from sonar_graph.navigation import Odometry, PreintegratedMotion
 from sonar_graph.navigation.alignment.allan import allan_deviation, degrees_of_freedom, density, noise_densities
 from sonar_graph.navigation.alignment.at_rest import (
     InitialTilt,
@@ -27,7 +28,7 @@ from sonar_graph.navigation.alignment.gravity import earth_rate_in_world, gravit
 from sonar_graph.testing import check_consistent
 
 from . import ways
-from .rows import NS, at, derivative, dvl
+from .rows import NS, at, derivative, dvl, imu, stamps
 from .ways import acceleration_at, attitude, rate_at, velocity_at
 
 G, HZ, REST_S = 9.80665, 50, 20.0
@@ -267,6 +268,16 @@ def test_up_is_found_in_a_moving_vehicle():
     assert np.linalg.norm(np.cross(up, truth)) < 1e-4
     naive, _ = gravity_direction(motion, np.zeros(3), np.zeros(3), 0.01, MOVING)
     assert np.arccos(naive @ truth) > np.radians(1)
+
+
+def test_a_filter_at_rest_lies_level_whatever_bias_its_gyros_have():
+    """To a milliradian, a tenth of what a bias turns the sum of forces in each second by."""
+    known = Calibration(
+        imu=ImuCalibration(gyro_bias_sigma=0.02, accel_bias_sigma=0), start=Start(rpy_sigma_rad=(0.1,) * 3)
+    )
+    rows = imu(stamps(50, 100.0), [0.02, -0.01, 0.0]), dvl(stamps(5, 100.0), 0.0, 1e-6 * np.eye(3))
+    found = InvariantEkf(known, Odometry(known)).process(Measurements(at(100.0), *rows))
+    assert found.world_T_body.rotation().rpy()[:2] == pytest.approx([0.0, 0.0], abs=1e-3)
 
 
 def test_stated_sigma_is_that_of_many_noisy_intervals():

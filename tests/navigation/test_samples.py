@@ -277,6 +277,33 @@ def test_repeats_are_left_out_wherever_they_are_in_a_block(offsets, kept):
     assert (odometry._rows()[0] - T0_NS).tolist() == kept
 
 
+@pytest.mark.parametrize("missing", range(1, 9))
+def test_a_row_that_comes_after_later_ones_is_an_epoch_from_the_instant_on_at_which_it_is_reached(missing):
+    """Nor is one of several that are known at once with the row that confirmed them."""
+    rows = driven()
+    rows, inertial = replace(rows, velocity=rows.velocity * 5.0), imu(stamps(50, SECONDS), 0.0)
+    odometry = Odometry(Calibration())
+    odometry.add(inertial, rows.rows(np.arange(len(rows)) != missing))
+    odometry.add(None, rows.rows(slice(missing, missing + 1)))
+    epochs_ns = odometry.epochs(0, T0_NS + 10 * NS)
+    assert np.array_equal(epochs_ns, rows.stamps_ns)
+    for until_ns in np.unique(odometry.reached_ns(epochs_ns)).tolist():
+        for instant_ns in (until_ns - 1, until_ns):
+            reached = odometry.reached_ns(epochs_ns) <= instant_ns
+            assert np.array_equal(odometry.epochs(0, instant_ns), epochs_ns[reached])
+
+
+@pytest.mark.parametrize(("ratio", "is_sound"), [(1e-11, True), (1e-12, True), (0.0, False), (-1e-12, False)])
+def test_a_covariance_is_sound_where_it_is_positive_definite_but_for_rounding(ratio, is_sound):
+    """In axes of which none is the log's."""
+    turn = np.linalg.qr(np.random.default_rng(0).standard_normal((3, 3)))[0]
+    rows = driven()
+    rows.velocity_cov[7] = 1e-4 * (turn * [1.0, 1.0, ratio]) @ turn.T
+    odometry = odometry_at_rest(rows)
+    assert told(odometry) == ([] if is_sound else [(7, Refusal.UNSOUND)])
+    assert len(odometry._rows()[3]) == len(rows) - (not is_sound)
+
+
 def test_only_rows_before_others_ask_for_motion_anew():
     odometry, rows = Odometry(Calibration()), driven()
     assert not odometry.add(imu(stamps(50, SECONDS), 0.0), rows.rows(slice(0, 5)))

@@ -102,38 +102,47 @@ def see(keyframes: Keyframes, after_s: float) -> PreintegratedMotion:
     return keyframes.set_for_frame(stamp, keyframes.motion_since_newest(stamp))
 
 
-def noisy_keyframes(share: float, **calibration) -> Keyframes:
-    """0.3 m/s at 5 Hz: the displacement's variance grows by 0.018 m^2 a second."""
-    dvl = DvlCalibration(velocity_sigma_m_s=(0.3, 0.3, 0.3))
+def noisy_keyframes(share: float, axis: int = 0, turn_rad_s: float = 0.0, **calibration) -> Keyframes:
+    """0.3 m/s along an axis at 5 Hz: the displacement's variance grows by 0.018 m^2 a second."""
+    dvl = DvlCalibration(velocity_sigma_m_s=tuple(0.01 + 0.29 * np.eye(3)[axis]))
     exact_gyro = ImuCalibration(gyro_noise_density=1e-12, gyro_bias_sigma=0.0)
     keyframes = keyframes_of(
         Calibration(**({"imu": exact_gyro, "dvl": dvl} | calibration)),
         POLICY.model_copy(update={"motion_noise_share": share}),
     )
-    keyframes.add(level_imu(1.99), steady_dvl(1.99), None)
+    keyframes.add(level_imu(1.99, turn_rad_s * np.eye(3)[axis]), steady_dvl(1.99), None)
     return keyframes
 
 
+@pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize(("blurred_s", "expected"), [(0.55, [0.0]), (0.57, [0.0, 0.4])])
-def test_a_frame_brings_one_once_the_motion_blurs_it_by_the_share(blurred_s, expected):
+def test_a_frame_brings_one_once_the_motion_blurs_it_by_the_share_along_any_axis(blurred_s, expected, axis):
     """A tenth of (0.3178 m)^2 is 0.0101 m^2, reached after 0.561 s; it sits at the newest reached node."""
     sonar = SonarCalibration(range_sigma_m=np.sqrt(0.018 * 0.561 / 0.1), azimuth_sigma_rad=1e3)
-    keyframes = noisy_keyframes(0.1, sonar=sonar)
+    keyframes = noisy_keyframes(0.1, axis, sonar=sonar)
     motion = see(keyframes, blurred_s)
     assert seconds(keyframes) == pytest.approx(expected)
     assert motion.i_T_j.translation() == pytest.approx([0.5 * (blurred_s - expected[-1]), 0, 0])
-    assert motion.covariance[3, 3] == pytest.approx(0.018 * (blurred_s - expected[-1]))
+    assert motion.covariance[3 + axis, 3 + axis] == pytest.approx(0.018 * (blurred_s - expected[-1]))
 
 
+@pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize(
     ("density", "bias_sigma", "azimuth_sigma_rad", "expected"),
     [(0.1, 0.0, 0.20, [0.0, 0.4]), (0.1, 0.0, 0.22, [0.0]), (1e-12, 0.1, 0.1, [0.0, 0.4]), (1e-12, 0.1, 0.15, [0.0])],
     ids=["noise", "noise under the share", "bias", "bias under the share"],
 )
-def test_the_turn_by_noise_or_unknown_bias_is_compared_with_azimuth(density, bias_sigma, azimuth_sigma_rad, expected):
-    """Noise of 0.1 rad/s/sqrt(Hz): 0.0045 rad^2 after 0.45 s, a tenth of (0.21 rad)^2; of a bias (0.045 rad)^2."""
+def test_the_turn_by_noise_or_unknown_bias_is_compared_with_azimuth(
+    density, bias_sigma, azimuth_sigma_rad, expected, axis
+):
+    """Noise of 0.1 rad/s/sqrt(Hz): 0.0045 rad^2 after 0.45 s, a tenth of (0.21 rad)^2; of a bias (0.045 rad)^2.
+
+    The latter about the axis of a turn; about others much of it cancels.
+    """
     keyframes = noisy_keyframes(
         0.1,
+        axis,
+        10.0,
         imu=ImuCalibration(gyro_noise_density=density, gyro_bias_sigma=bias_sigma),
         dvl=EXACT_DVL,
         sonar=SonarCalibration(range_sigma_m=1e3, azimuth_sigma_rad=azimuth_sigma_rad),
@@ -388,6 +397,24 @@ def test_over_a_gap_a_keyframe_has_the_motion_that_frames_have_and_only_depths_n
     (between,) = (f for f in factors_of(keyframes.smoother.graph) if isinstance(f, gtsam.BetweenFactorPose3))
     np.testing.assert_allclose(between.noiseModel().covariance(), motion.covariance, rtol=1e-6, atol=1e-15)
     assert len(factors_on(keyframes, gtsam.GPSFactorArm, X(1))) == count
+
+
+@pytest.mark.parametrize("lost_s", [[2.05], [2.15], [2.12, 2.17]])
+def test_depths_too_long_before_the_end_of_a_gap_leave_the_factor_of_the_others(lost_s):
+    """From 2.0 s to 2.4 s; none is carried on for longer than without a Doppler row, 0.21 s."""
+    calibration = Calibration(imu=NO_BIAS, dvl=DvlCalibration(velocity_sigma_m_s=(0.01,) * 3, gap_s=0.21))
+    found = []
+    for when in ([2.5, 2.7], [*lost_s, 2.5, 2.7]):
+        keyframes = keyframes_of(calibration, POLICY.model_copy(update={"max_interval_s": 2.8}))
+        log = steady_dvl(3.0)
+        depth = Depth(at(*when), 0.1 * np.array(when), np.full(len(when), 1e-4))
+        keyframes.add(level_imu(3.0), log.rows(log.stamps_ns != at(2.2)[0]), depth)
+        keyframes.advance(int(at(3.0)[0]))
+        assert seconds(keyframes) == [0.0, 2.8]
+        found.append((error_of(keyframes, gtsam.GPSFactorArm), factor_of(keyframes, gtsam.GPSFactorArm)))
+    (error, factor), (expected, alone) = found[1], found[0]
+    assert error == pytest.approx(expected, abs=1e-12)
+    assert factor.noiseModel().sigmas() == pytest.approx(alone.noiseModel().sigmas())
 
 
 @pytest.mark.parametrize("k", [2, 3])
