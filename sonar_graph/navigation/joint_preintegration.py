@@ -24,7 +24,7 @@ import numpy as np
 
 from sonar_graph.calibration import SHORTEST_HOLE_S, Calibration
 from sonar_graph.errors import CalibrationError, MeasurementError
-from sonar_graph.measurements import Dvl, Floats, Imu, Ints
+from sonar_graph.measurements import Dvl, Floats, Imu
 from sonar_graph.motion import PreintegratedMotion
 from sonar_graph.navigation.imu_gaps import UNTURNED, row_after_hole
 from sonar_graph.navigation.inertial import Line, hat, spread, sums_along
@@ -63,20 +63,6 @@ RULES: dict[DopplerRule, Rule | None] = {
 """Others than "inertial" and "linear" are those of other projects, for comparison (docs/theory/preintegration.md)."""
 LONG_S = 0.4
 """Interval of Doppler samples above which "inertial" takes the log's way about the IMU's point from the gyros."""
-
-
-def with_rate_noise(cov: Floats, dvl_ns: Ints, imu_ns: Ints, gyro_density: float, arm: Floats) -> Floats:
-    """Covariances (n, 3, 3) of ``z - w x l`` at samples that begin or end a long interval, of z at others.
-
-    More by ``n_g² / dt [l]x [l]x^T`` with the mean time dt between inertial rows; ``arm``: l, from the IMU to the log.
-    """
-    is_long = np.diff(dvl_ns) > LONG_S * 1e9
-    if not is_long.any():
-        return cov
-    at_end = np.r_[False, is_long] | np.r_[is_long, False]
-    rows_per_s = (len(imu_ns) - 1) * 1e9 / (imu_ns[-1] - imu_ns[0])
-    turned = gyro_density * gtsam.SO3.Hat(arm)
-    return cov + np.where(at_end[:, None, None], rows_per_s * turned @ turned.T, 0.0)
 
 
 ROTATION, VELOCITY, POSITION, DISPLACEMENT = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
@@ -226,8 +212,7 @@ class JointPreintegrator:
     longest_s: float = 1.5
     """Longest interval between Doppler samples, for all rules but "inertial"."""
     longest_hole_s: float = SHORTEST_HOLE_S
-    """Longest interval between inertial rows where that is more than five typical ones: the turn in it is not
-    measured."""
+    """Longest interval between inertial rows, or five typical ones if that is longer: no turn is measured in it."""
 
     def __post_init__(self) -> None:
         if self.rule not in RULES:
@@ -291,11 +276,14 @@ class JointPreintegrator:
         require_covariances("Dvl.velocity_cov", cov, samples.stamps_ns)
         velocity, cov = samples.velocity @ body_R_dvl.T, body_R_dvl @ cov @ body_R_dvl.T
         arms = self.body_T_imu.translation(), self.body_T_dvl.translation()
-        arm = arms[1] - arms[0]
+        arm, between_ns = arms[1] - arms[0], np.diff(samples.stamps_ns)
         if self.rule == "inertial":
-            cov = with_rate_noise(cov, samples.stamps_ns, inertial.stamps_ns, self.gyro_noise_density, arm)
+            # Of z - w x l at the ends of long intervals: more by n_g^2 / dt [l]x [l]x^T, dt the mean IMU interval.
+            is_long, imu_ns = between_ns > LONG_S * 1e9, inertial.stamps_ns
+            at_end = np.append(False, is_long) | np.append(is_long, False)
+            turned = self.gyro_noise_density * gtsam.SO3.Hat(arm)
+            cov[at_end] += (len(imu_ns) - 1) * 1e9 / (imu_ns[-1] - imu_ns[0]) * turned @ turned.T
         else:
-            between_ns = np.diff(samples.stamps_ns)
             k = int(between_ns.argmax())
             if between_ns[k] > self.longest_s * 1e9:
                 raise MeasurementError(
@@ -346,8 +334,7 @@ class JointPreintegrator:
             W, velocity = np.zeros(len(cuts_ns) - 1), np.zeros((2, len(cuts_ns) - 1, 3))
         line = Line(cuts_ns, rule is None, W, jumps, velocity[0], velocity[1], int(at_ns[0]))
         sums = sums_along(rows, len(rows.imu_ns), line, np.eye(3), bias, earth)
-        errors = spread(sums, sums.whole, T, self.gyro_noise_density, self.accel_noise_density)
-        R = sums.R[-1]
+        R, errors = sums.R[-1], spread(sums, sums.whole, T, self.gyro_noise_density, self.accel_noise_density)
         if rule is None:
             weights = w[:, None, None] * sums.R
             if by_rate_s.any():

@@ -207,7 +207,8 @@ class Keyframes:
 
         At the first question they would depend on who asks.
         """
-        self._linearised, self._latest = (self.bias(len(self.stamps_ns) - 1), self._attitude()), None
+        attitude = self.smoother.values.atPose3(self.newest_key).rotation().matrix()
+        self._linearised, self._latest = (self.bias(len(self.stamps_ns) - 1), attitude), None
 
     def update_if_due(self) -> Changed | None:
         """Bring the smoother up to date when what was added since it last was matters."""
@@ -221,16 +222,12 @@ class Keyframes:
         """Key of the bias that holds from a keyframe on, -1 the newest; None when there is none to estimate."""
         return self.bias_keys[index] if self._estimates_bias else None
 
-    def _attitude(self) -> Floats:
-        """world_R_body at the newest keyframe."""
-        return self.smoother.values.atPose3(self.newest_key).rotation().matrix()
-
     def _set(self, node_ns: int, known_ns: int) -> None:
         """Set a keyframe at an epoch that is reached at an instant."""
         i, j = len(self.stamps_ns) - 1, len(self.stamps_ns)
-        start_ns, bias, attitude = self.stamps_ns[-1], self.bias(i), self._attitude()
-        motion = self.odometry.motion(start_ns, node_ns, bias, attitude, known_ns)
-        self.smoother.add_pose(X(j), self.smoother.values.atPose3(X(i)).compose(motion.i_T_j), node_ns * S_PER_NS)
+        start_ns, bias, world_T_i = self.stamps_ns[-1], self.bias(i), self.smoother.values.atPose3(X(i))
+        motion = self.odometry.motion(start_ns, node_ns, bias, world_T_i.rotation().matrix(), known_ns)
+        self.smoother.add_pose(X(j), world_T_i.compose(motion.i_T_j), node_ns * S_PER_NS)
         if self._estimates_bias:
             between = factors.odometry_with_bias(X(i), X(j), self.bias_keys[i], motion)
         else:
