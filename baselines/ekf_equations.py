@@ -160,7 +160,8 @@ def location(
     R, X, T = body_after(x, motion.dR, motion.dp)
     q = sonar.body_p_sonar + sonar.body_R_sonar @ sonar_point(z[0], z[1], elevation_rad)
     minus_q_x = np.array([[0.0, q[2], -q[1]], [-q[2], 0.0, q[0]], [q[1], -q[0], 0.0]])
-    G_b = R @ np.hstack([minus_q_x, np.eye(3)])
+    G_b = np.empty((3, 6))
+    G_b[:, :3], G_b[:, 3:] = R @ minus_q_x, R
     return X + R @ q, G_b @ T, G_b, R @ sonar.body_R_sonar @ sonar_point_jacobian(z[0], z[1], elevation_rad)
 
 
@@ -244,7 +245,9 @@ def augment(x: Floats, P: Floats, motion: Motion, sonar: SonarModel, z: Floats, 
     p, G_v, G_b, G_z = location(x, motion, sonar, z, sonar.elevation_of_new(R, X, z))
     P_pv = G_v @ P[:POSE]
     P_pp = P_pv[:, :POSE] @ G_v.T + G_b @ motion.C @ G_b.T + G_z @ polar_covariance(R_z, sonar.aperture_rad) @ G_z.T
-    x, P = np.concatenate([x, p]), np.block([[P, P_pv.T], [P_pv, 0.5 * (P_pp + P_pp.T)]])
+    n = len(x)
+    x, P_vm, P = np.concatenate([x, p]), P, np.empty((n + LANDMARK, n + LANDMARK))
+    P[:n, :n], P[n:, :n], P[:n, n:], P[n:, n:] = P_vm, P_pv, P_pv.T, 0.5 * (P_pp + P_pp.T)
     if (sonar.floor_z_m - x[-1]) ** 2 <= FLOOR_GATE * (P[-1, -1] + sonar.floor_variance_m2):
         correct_number(x, P, len(x) - 1, sonar.floor_z_m, sonar.floor_variance_m2)
     return x, P

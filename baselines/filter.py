@@ -16,7 +16,6 @@ Far landmarks (`far_view`) and the choices that the paper leaves open: docs/theo
 
 import math
 from abc import ABC, abstractmethod
-from bisect import bisect_left
 from typing import NamedTuple
 
 import gtsam
@@ -318,7 +317,7 @@ def far_view(
 
 # ------------------------------------------------------------------------------------------------- the shell
 
-NO_BIAS, NO_STAMPS, NO_DEPTH = np.zeros(3), np.empty(0, np.int64), np.empty(0)
+NO_BIAS, NO_STAMPS, NO_DEPTH, NO_GRAVITY = np.zeros(3), np.empty(0, np.int64), np.empty(0), np.empty((0, 8))
 NO_PAIRS, NO_COV = np.empty((0, 2)), np.empty((0, 2, 2))
 NO_VIEWS = Views(NO_STAMPS, NO_STAMPS, NO_PAIRS, NO_COV, np.empty(0, np.int8), NO_PAIRS, NO_COV)
 KEPT_NS = 10_000_000_000
@@ -458,8 +457,7 @@ class FilterShell(ABC):
         start_ns = self.odometry.start_by(end_ns)
         if start_ns is None:
             return
-        waiting = range(start_ns, end_ns)
-        self._reached_ns = start_ns + bisect_left(waiting, True, key=lambda t: self.odometry.start_by(t) is not None)
+        self._reached_ns = int(self.odometry.reached_ns(np.array([start_ns]))[0])
         self.node_ns = self._opened_ns = self._kept_ns = start_ns
         self._opened_velocity = self.odometry.velocity_at_imu(start_ns)
 
@@ -483,20 +481,21 @@ class FilterShell(ABC):
     def _use(self, measurements: Measurements, since_ns: int, ids: Ints, views: Views) -> Estimate:
         """Carry the state to the newest epoch reached at the end of the call, with all measurements on the way."""
         events = self._events(measurements, since_ns, views)
-        kinds, is_over_gap, k = events.kind.tolist(), np.isnan(events.motions.dp[:, 0]).tolist(), 0
+        kinds, k = events.kind.tolist(), 0
         while kinds[k] != END:
             if kinds[k] == PLANE and self._plane is not None:
                 self.correct_plane(self._plane)
             else:
-                if is_over_gap[k]:
-                    self._bridge(events, k)
                 used_until = self.advance(events, k)
                 if used_until > k:
                     k = used_until
                     continue
+                if math.isnan(events.motions.dp[k, 0]):
+                    self._bridge(events, k)
+                    continue
                 self._see(ids, self.motion_to(events, k), views, int(events.row[k]))
             k += 1
-        if is_over_gap[k]:
+        if math.isnan(events.motions.dp[k, 0]):
             self._bridge(events, k)
         self.node_ns = int(events.start_ns[k])
         R, X, covariance = self.pose_after(self.motion_to(events, k))
@@ -521,15 +520,21 @@ class FilterShell(ABC):
         )  # fmt: skip
         stamp_ns, start_ns, until_ns, kind, row = columns[:, :n]
         motions = self.odometry.motions(start_ns, until_ns, stamp_ns, NO_BIAS)
-        gravity = []
-        for epoch_ns in until_ns[kind == GRAVITY].tolist():
+        gravity, has_rate = NO_GRAVITY, np.full(n, self._has_rate)
+        if GRAVITY in kind.tolist():
+            gravity = self._gravity(until_ns[kind == GRAVITY].tolist())
+        return Events(stamp_ns, start_ns, until_ns, kind, row, motions, has_rate, z_m, variance_m2, gravity, views)
+
+    def _gravity(self, epochs_ns: list[int]) -> Floats:
+        """Intervals of gravity that end at epochs, as `Events.gravity`."""
+        intervals = []
+        for epoch_ns in epochs_ns:
             duration_s, (velocity_i, variance_i) = (epoch_ns - self._opened_ns) * 1e-9, self._opened_velocity
             velocity_j, variance_j = self._opened_velocity = self.odometry.velocity_at_imu(epoch_ns)
             sigma = tilt_sigma(duration_s, math.sqrt(0.5 * (variance_i + variance_j)), self.calibration)
-            gravity.append((*velocity_i.tolist(), *velocity_j.tolist(), duration_s, sigma))
+            intervals.append((*velocity_i.tolist(), *velocity_j.tolist(), duration_s, sigma))
             self._opened_ns = epoch_ns
-        intervals, has_rate = np.array(gravity).reshape(-1, 8), np.full(n, self._has_rate)
-        return Events(stamp_ns, start_ns, until_ns, kind, row, motions, has_rate, z_m, variance_m2, intervals, views)
+        return np.array(intervals)
 
     def motion_to(self, events: Events, k: int) -> Motion:
         """Motion to an event, without the gyro bias of the state and the Earth's rate."""

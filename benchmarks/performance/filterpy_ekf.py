@@ -21,7 +21,7 @@ from sonar_graph.motion import PreintegratedMotion
 from sonar_graph.navigation import Odometry
 from sonar_graph.navigation.alignment import gravity_direction
 from sonar_graph.sequence import Sequence
-from sonar_graph.slam.landmarks import gate_threshold, identify
+from sonar_graph.slam.landmarks import ACCEPTED, gate_threshold, identify
 from sonar_graph.slam.models import FLOOR_GATE, elevation_on_floor, locate_jacobians, range_azimuth_jacobians
 
 GATE_PROBABILITY = 0.999
@@ -232,8 +232,8 @@ class _Feed:
         detections = self.sequence.detections
         assert detections is not None
         one = detections.rows(slice(row, row + 1))
-        ids, refusals = identify(one, MINIMUM_ID_PROBABILITY)
-        if refusals[0] is not None:
+        ids, outcomes = identify(one, MINIMUM_ID_PROBABILITY)
+        if outcomes[0] != ACCEPTED:
             return
         sonar = self.slam.calibration.sonar
         R = one.range_azimuth_cov[0]
@@ -253,7 +253,7 @@ def run(sequence: Sequence, until_ns: int, *, predicts_by_node: bool = False) ->
         Predict once a DVL node, over the motion preintegrated since the node before, and not once a sample.
     """
     odometry = Odometry(sequence.calibration)
-    odometry.add(sequence.imu, sequence.dvl)
+    odometry.add(*(rows.between(sequence.start_ns - 1, until_ns) for rows in (sequence.imu, sequence.dvl)))
     start_ns = odometry.start_by(until_ns)
     assert start_ns is not None
     slam = FilterpySlam(sequence.calibration)
