@@ -257,15 +257,16 @@ class SonarModel(NamedTuple):
 
 
 @compiled
-def noise_of(logged: Floats, R_z: Floats) -> Floats:
-    """Covariances of detections (m, 2, 2): symmetric, and R_z where the log has none."""
-    noise = np.empty(logged.shape)
-    for k in range(len(logged)):
+def read(range_m: Floats, azimuth_rad: Floats, logged: Floats, R_z: Floats) -> tuple[Floats, Floats]:
+    """Detections z (m, 2) and their covariances (m, 2, 2): symmetric, and R_z where the log has none."""
+    z, noise = np.empty((len(range_m), 2)), np.empty(logged.shape)
+    for k in range(len(z)):
+        z[k, 0], z[k, 1] = range_m[k], azimuth_rad[k]
         cross = 0.5 * (logged[k, 0, 1] + logged[k, 1, 0])
         is_known = not math.isnan(logged[k, 0, 0] + cross + logged[k, 1, 1])
         noise[k, 0, 0], noise[k, 1, 1] = (logged[k, 0, 0], logged[k, 1, 1]) if is_known else (R_z[0, 0], R_z[1, 1])
         noise[k, 0, 1] = noise[k, 1, 0] = cross if is_known else R_z[0, 1]
-    return noise
+    return z, noise
 
 
 def polar_covariance(R_z: Floats, aperture_rad: float) -> Floats:
@@ -474,9 +475,9 @@ class FilterShell(ABC):
             outcome[stamps_ns < since_ns] = OUTCOME_NUMBERS[Outcome.LATE]
             outcome[stamps_ns < self._reached_ns] = OUTCOME_NUMBERS[Outcome.UNLOCATED]
         landmark = np.array([-1 if self._was_lost else self._slots.get(i, -1) for i in ids.tolist()])
-        z, e, S = np.empty((n, 2)), np.full((n, 2), math.nan), np.full((n, 2, 2), math.nan)
-        z[:, 0], z[:, 1] = detections.range_m, detections.azimuth_rad
-        return ids, Views(stamps_ns, landmark, z, noise_of(detections.range_azimuth_cov, self.sonar.R_z), outcome, e, S)
+        z, R_z = read(detections.range_m, detections.azimuth_rad, detections.range_azimuth_cov, self.sonar.R_z)
+        e, S = np.full((n, 2), math.nan), np.full((n, 2, 2), math.nan)
+        return ids, Views(stamps_ns, landmark, z, R_z, outcome, e, S)
 
     def _use(self, measurements: Measurements, since_ns: int, ids: Ints, views: Views) -> Estimate:
         """Carry the state to the newest epoch reached at the end of the call, with all measurements on the way."""

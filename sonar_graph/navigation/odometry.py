@@ -183,14 +183,17 @@ class Odometry:
 
     def velocity_at_imu(self, epoch_ns: int) -> tuple[Floats, float]:
         """Velocity of the IMU's point at an epoch, body axes, shape (3,), m/s, and the variance of one component."""
-        if epoch_ns not in self._dvl.stamps_ns:
-            raise no_doppler_stamp("epoch_ns", epoch_ns, self._dvl.stamps_ns)
-        k, i = (int(stamps.searchsorted(epoch_ns)) for stamps in (self._dvl.stamps_ns, self._imu.stamps_ns))
-        (velocity, cov, _), (rates, _), imu_ns = self._dvl.values, self._imu.values, self._imu.stamps_ns
-        rate = rates[min(i, len(rates) - 1)]
+        (velocity, cov, _), (rates, _) = self._dvl.values, self._imu.values
+        dvl_ns, imu_ns = self._dvl.stamps_ns, self._imu.stamps_ns
+        k, i = int(dvl_ns.searchsorted(epoch_ns)), int(imu_ns.searchsorted(epoch_ns))
+        if k == len(dvl_ns) or dvl_ns[k] != epoch_ns:
+            raise no_doppler_stamp("epoch_ns", epoch_ns, dvl_ns)
+        a, b, c = rates[min(i, len(rates) - 1)].tolist()
         if 0 < i < len(rates) and not self._hold_past:
-            rate = rates[i - 1] + (epoch_ns - imu_ns[i - 1]) / (imu_ns[i] - imu_ns[i - 1]) * (rates[i] - rates[i - 1])
-        (x, y, z), (a, b, c) = rate.tolist(), self._dvl_p_imu
+            a_0, b_0, c_0 = rates[i - 1].tolist()
+            share = float((epoch_ns - imu_ns[i - 1]) / (imu_ns[i] - imu_ns[i - 1]))
+            a, b, c = a_0 + share * (a - a_0), b_0 + share * (b - b_0), c_0 + share * (c - c_0)
+        x, y, z = self._dvl_p_imu
         swing = y * c - z * b, z * a - x * c, x * b - y * a
         return velocity[k] + swing, float(cov[k, 0, 0] + cov[k, 1, 1] + cov[k, 2, 2]) / 3.0
 

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from baselines.filter import SonarModel, far_view, is_inside, noise_of
+from baselines.filter import SonarModel, far_view, is_inside, read
 from sonar_graph.calibration import FloorPrior, SonarCalibration
 from sonar_graph.measurements import NS_PER_S
 from sonar_graph.navigation import Odometry
@@ -176,7 +176,7 @@ def test_the_innovation_of_azimuth_wraps_around(filter_):
 def test_noise_is_the_log_s_made_symmetric_and_where_it_has_a_hole_the_calibration_s(hole):
     logged = np.array([[[4e-4, 3e-5], [1e-5, 1e-4]]] * 2)
     logged[(1, *hole)] = math.nan
-    assert_allclose(noise_of(logged, NOISE), [[[4e-4, 2e-5], [2e-5, 1e-4]], NOISE])
+    assert_allclose(read(*np.ones((2, 2)), logged, NOISE)[1], [[[4e-4, 2e-5], [2e-5, 1e-4]], NOISE])
 
 
 # ---------------------------------------------------------------------------------------------- views from far away

@@ -159,7 +159,12 @@ class VelocityConfirmation:
     def accept(self, whole_ns: Ints) -> None:
         """Take note of whole rows that the gate accepted."""
         if len(whole_ns):
-            self._recent_ns = sorted({*self._recent_ns, *whole_ns[-RECENT:].tolist()})[-RECENT:]
+            recent = whole_ns[-RECENT:].tolist()
+            if self._recent_ns and recent[0] <= self._recent_ns[-1]:
+                recent = sorted({*self._recent_ns, *recent})
+            else:
+                recent = self._recent_ns + recent
+            self._recent_ns = recent[-RECENT:]
 
     def confirm(self, stamp_ns: int, velocity: Floats, cov: Floats, *, is_partial: bool) -> Confirmed:
         """Take in one row; return those, of it and the waiting ones, that may go on."""
