@@ -23,7 +23,6 @@ from baselines.filter import (
     FilterParams,
     FilterShell,
     Motion,
-    SonarModel,
     add_force,
     corrected,
     up_at_end,
@@ -41,11 +40,11 @@ SINGULAR_COSINE = 1e-3
 
 @compiled
 def advance(
-    x: Floats, P: Floats, i_R_j: Floats, impulse: Floats, earth: Floats, port: Floats, sonar: SonarModel,
-    events: Events, k: int,
+    x: Floats, P: Floats, i_R_j: Floats, impulse: Floats, earth: Floats, port: Floats,
+    body_R_sonar: Floats, body_p_sonar: Floats, gate: float, events: Events, k: int,
 ) -> int:  # fmt: skip
     """Use events from k on, up to a gap, a landmark that is new or may be far, or an event of another kind."""
-    (dR, dp, C, D, force), views = events.motions, events.views
+    dR, dp, C, D, force = events.dR, events.dp, events.C, events.D, events.impulse
     while not math.isnan(dp[k, 0]):
         kind, row = events.kind[k], events.row[k]
         if events.has_rate[k]:
@@ -62,15 +61,15 @@ def advance(
         elif kind == DEPTH:
             correct_depth(x, P, dR[k], dp[k], C[k], port, events.z_m[row], events.variance_m2[row])
         elif kind == FRAME:
-            while row < len(views.stamp_ns) and views.stamp_ns[row] == events.stamp_ns[k]:
-                if views.outcome[row] == ACCEPTED:
-                    if views.landmark[row] < 0:
+            while row < len(events.seen_ns) and events.seen_ns[row] == events.stamp_ns[k]:
+                if events.outcome[row] == ACCEPTED:
+                    if events.landmark[row] < 0:
                         return k
-                    is_used, views.e[row], views.S[row] = observe(
-                        x, P, POSE + LANDMARK * views.landmark[row], dR[k], dp[k], C[k],
-                        sonar.body_R_sonar, sonar.body_p_sonar, views.z[row], views.R_z[row], sonar.gate,
+                    is_used, events.e[row], events.S[row] = observe(
+                        x, P, POSE + LANDMARK * events.landmark[row], dR[k], dp[k], C[k],
+                        body_R_sonar, body_p_sonar, events.z[row], events.R_z[row], gate,
                     )  # fmt: skip
-                    views.outcome[row] = USED if is_used else GATED
+                    events.outcome[row] = USED if is_used else GATED
                 row += 1
         else:
             break
@@ -132,7 +131,7 @@ class EkfSlam(FilterShell):
         EstimatorError
             When the pitch comes so near 90 degrees that the Euler angles are singular.
         """
-        k = advance(self._x, self._P, self.turned, self.impulse, self.earth, self.port, self.sonar, events, k)
+        k = advance(self._x, self._P, self.turned, self.impulse, self.earth, self.port, *self.sonar[:3], events, k)
         if math.cos(self._x[4]) < SINGULAR_COSINE:
             raise EstimatorError(
                 f"ekf-slam: pitch is {math.degrees(self._x[4]):.2f} deg at {events.start_ns[k]} ns, where the Euler"

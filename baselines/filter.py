@@ -121,10 +121,9 @@ class Views(NamedTuple):
     S: Floats
 
 
-def accepted_rows(views: Views, first: int) -> list[int]:
+def accepted_rows(seen_ns: Ints, outcome: NDArray[np.int8], first: int) -> list[int]:
     """Detections of a frame that are to be used, of which one is given."""
-    is_accepted = (views.stamp_ns == views.stamp_ns[first]) & (views.outcome == ACCEPTED)
-    return np.flatnonzero(is_accepted).tolist()
+    return np.flatnonzero((seen_ns == seen_ns[first]) & (outcome == ACCEPTED)).tolist()
 
 
 class Events(NamedTuple):
@@ -138,21 +137,32 @@ class Events(NamedTuple):
     kind: Ints
     row: Ints
     """Number of the depth sample, interval of gravity, or first detection of the frame."""
-    motions: Motions
-    """All NaN over a gap, until that is bridged."""
+    dR: Floats
+    """Columns of `Motions`; NaN over a gap, until that is bridged."""
+    dp: Floats
+    C: Floats
+    D: Floats
+    impulse: Floats
     has_rate: NDArray[np.bool_]
     """True where a gyro bias and the Earth's rate are still in a motion."""
     z_m: Floats
-    """Depth samples, with their variances; then the detections."""
+    """Depth samples, with their variances."""
     variance_m2: Floats
     gravity: Floats
     """Intervals of gravity: velocity of the IMU's point at both ends, duration, and sigma of the tilt, shape (g, 8)."""
-    views: Views
+    seen_ns: Ints
+    """Columns of `Views`."""
+    landmark: Ints
+    z: Floats
+    R_z: Floats
+    outcome: NDArray[np.int8]
+    e: Floats
+    S: Floats
 
 
 @compiled
 def in_order(
-    epochs_ns: Ints, reached_ns: Ints, depth_ns: Ints, views: Views, since_ns: int,
+    epochs_ns: Ints, reached_ns: Ints, depth_ns: Ints, seen_ns: Ints, outcome: NDArray[np.int8], since_ns: int,
     end_ns: int, node_ns: int, opened_ns: int, interval_ns: int, is_planar: bool, out: Ints,
 ) -> int:  # fmt: skip
     """Write the first five columns of `Events` into the rows of ``out``, up to the end of a call; their number.
@@ -173,11 +183,11 @@ def in_order(
         else:
             while d < len(depth_ns) and depth_ns[d] < since_ns:
                 d += 1
-            while r < len(views.stamp_ns) and (views.stamp_ns[r] == frame_ns or views.outcome[r] != ACCEPTED):
+            while r < len(seen_ns) and (seen_ns[r] == frame_ns or outcome[r] != ACCEPTED):
                 r += 1
             stamp_ns, until_ns, kind, row = end_ns, end_ns, END, 0
-            if r < len(views.stamp_ns):
-                stamp_ns, until_ns, kind, row = views.stamp_ns[r], views.stamp_ns[r], FRAME, r
+            if r < len(seen_ns):
+                stamp_ns, until_ns, kind, row = seen_ns[r], seen_ns[r], FRAME, r
             if d < len(depth_ns) and depth_ns[d] <= stamp_ns:
                 stamp_ns, until_ns, kind, row = depth_ns[d], depth_ns[d], DEPTH, d
             if e < len(epochs_ns) and reached_ns[e] <= stamp_ns:
@@ -491,12 +501,12 @@ class FilterShell(ABC):
                 if used_until > k:
                     k = used_until
                     continue
-                if math.isnan(events.motions.dp[k, 0]):
+                if math.isnan(events.dp[k, 0]):
                     self._bridge(events, k)
                     continue
                 self._see(ids, self.motion_to(events, k), views, int(events.row[k]))
             k += 1
-        if math.isnan(events.motions.dp[k, 0]):
+        if math.isnan(events.dp[k, 0]):
             self._bridge(events, k)
         self.node_ns = int(events.start_ns[k])
         R, X, covariance = self.pose_after(self.motion_to(events, k))
@@ -515,16 +525,18 @@ class FilterShell(ABC):
             depth_ns, z_m = depth.stamps_ns, depth.z_m
             variance_m2 = np.where(np.isnan(depth.variance_m2), self._depth_variance, depth.variance_m2)
         columns = np.empty((5, 3 * len(epochs_ns) + len(depth_ns) + len(views.stamp_ns) + 1), np.int64)
+        reached_ns, is_planar = self.odometry.reached_ns(epochs_ns), self._plane is not None
         n = in_order(
-            epochs_ns, self.odometry.reached_ns(epochs_ns), depth_ns, views, since_ns, end_ns, self.node_ns,
-            self._opened_ns, self._interval_ns, self._plane is not None, columns,
+            epochs_ns, reached_ns, depth_ns, views.stamp_ns, views.outcome, since_ns, end_ns,
+            self.node_ns, self._opened_ns, self._interval_ns, is_planar, columns,
         )  # fmt: skip
         stamp_ns, start_ns, until_ns, kind, row = columns[:, :n]
         motions = self.odometry.motions(start_ns, until_ns, stamp_ns, NO_BIAS)
         gravity, has_rate = NO_GRAVITY, np.full(n, self._has_rate)
         if GRAVITY in kind.tolist():
             gravity = self._gravity(until_ns[kind == GRAVITY].tolist())
-        return Events(stamp_ns, start_ns, until_ns, kind, row, motions, has_rate, z_m, variance_m2, gravity, views)
+        happening = stamp_ns, start_ns, until_ns, kind, row, *motions, has_rate
+        return Events(*happening, z_m, variance_m2, gravity, *views)
 
     def _gravity(self, epochs_ns: list[int]) -> Floats:
         """Intervals of gravity that end at epochs, as `Events.gravity`."""
@@ -539,7 +551,7 @@ class FilterShell(ABC):
 
     def motion_to(self, events: Events, k: int) -> Motion:
         """Motion to an event, without the gyro bias of the state and the Earth's rate."""
-        dR, dp, C, D, impulse = (column[k] for column in events.motions)
+        dR, dp, C, D, impulse = (column[k] for column in events[5:10])
         if events.has_rate[k]:
             dR, dp, impulse = corrected(dR, dp, D, impulse, self.gyro_bias(), self.attitude().T @ self.earth)
         return Motion(dR, dp, C, D, impulse)
@@ -556,19 +568,19 @@ class FilterShell(ABC):
         if not self.has_bias:
             C[3:, 3:] += self.calibration.imu.gyro_bias_sigma**2 * D[3:] @ D[3:].T
         if kind in (DEPTH, FRAME):
-            more = 1 if kind == DEPTH else len(accepted_rows(events.views, row))
+            more = 1 if kind == DEPTH else len(accepted_rows(events.seen_ns, events.outcome, row))
             self._in_gap[start_ns, kind] = count = self._in_gap.get((start_ns, kind), 0) + more
             C *= count * (count + 1)
-        self._was_lost, events.has_rate[k], events.views.landmark[:] = True, False, -1
+        self._was_lost, events.has_rate[k], events.landmark[:] = True, False, -1
         pose, impulse = over.i_T_j, over.mean_specific_force * over.duration_s
         for column, value in zip(
-            events.motions, (pose.rotation().matrix(), pose.translation(), C, D, impulse), strict=True
+            events[5:10], (pose.rotation().matrix(), pose.translation(), C, D, impulse), strict=True
         ):
             column[k] = value
 
     def _see(self, ids: Ints, motion: Motion, views: Views, first: int) -> None:
         """Update by the landmarks of a frame, or append them at first sight."""
-        for row in accepted_rows(views, first):
+        for row in accepted_rows(views.stamp_ns, views.outcome, first):
             landmark_id, z, R_z = int(ids[row]), views.z[row], views.R_z[row]
             if landmark_id not in self._slots:
                 self.augment(motion, z, R_z)

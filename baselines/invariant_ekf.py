@@ -89,7 +89,7 @@ class InvariantEkf(FilterShell):
 
     def advance(self, events: Events, k: int) -> int:
         """Predict over epochs and correct by depth, from event k on."""
-        while events.kind[k] in (EPOCH, GRAVITY, DEPTH) and not np.isnan(events.motions.dp[k, 0]):
+        while events.kind[k] in (EPOCH, GRAVITY, DEPTH) and not np.isnan(events.dp[k, 0]):
             motion, row = self.motion_to(events, k), events.row[k]
             if events.kind[k] == GRAVITY:
                 up = up_at_end(self.turned, self.impulse, events.gravity[row])

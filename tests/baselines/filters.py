@@ -15,7 +15,6 @@ from baselines.invariant_ekf import InvariantEkf
 from baselines.invariant_equations import InvariantState
 from sonar_graph.calibration import Calibration, DepthCalibration, Mounting, SonarCalibration
 from sonar_graph.measurements import NS_PER_S, Floats
-from sonar_graph.motion import Motions
 from sonar_graph.navigation import Odometry
 
 SONAR = Mounting(translation_m=(0.4, 0.1, -0.2), rpy_rad=(0.1, 0.5, -0.2))
@@ -94,8 +93,8 @@ def one_event(kind: int, motion: Motion, duration_s: float, numbers: Any = (0.0,
     ``numbers``: height and its variance, or those of an interval of gravity.
     """
     stamps = np.array([[0, 0], [0, 0], [round(duration_s * NS_PER_S)] * 2, [kind, END], [0, 0]], np.int64)
-    motions, values = Motions(*(np.array([part, part]) for part in motion)), np.array([numbers], float)
-    return Events(*stamps, motions, np.zeros(2, bool), *values.T[:2].copy(), values, NO_VIEWS)
+    motions, values = [np.array([part, part]) for part in motion], np.array([numbers], float)
+    return Events(*stamps, *motions, np.zeros(2, bool), *values.T[:2].copy(), values, *NO_VIEWS)
 
 
 def predict(slam: FilterShell, motion: Motion, duration_s: float = 1.0) -> None:

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from baselines.dead_reckoning import DeadReckoning
 from baselines.ekf_slam import EkfSlam
-from baselines.filter import DEPTH, END, EPOCH, FRAME, GRAVITY, PLANE, USED, Motion, Views, corrected, in_order
+from baselines.filter import DEPTH, END, EPOCH, FRAME, GRAVITY, PLANE, USED, Motion, corrected, in_order
 from baselines.invariant_ekf import InvariantEkf
 from sonar_graph.calibration import (
     Calibration,
@@ -347,17 +347,11 @@ def test_a_bias_and_the_earth_s_rate_are_removed_from_a_motion_as_from_its_rows(
 def test_events_come_in_the_order_of_their_stamps_each_with_its_motion_from_the_newest_epoch():
     """At equal stamps epoch, plane, gravity, depth, frame; gravity where its interval is long enough."""
     depth, seen = np.array([3, 10, 20, 50]), np.array([18, 20, 20, 45, 45])
-    views = Views(
-        seen,
-        seen,
-        *[np.empty(0)] * 2,
-        np.array([*[ACCEPTED] * 3, USED, ACCEPTED], np.int8),
-        *[np.empty(0)] * 2,
-    )
+    outcome = np.array([*[ACCEPTED] * 3, USED, ACCEPTED], np.int8)
 
     def events(interval_ns, is_planar=False):
         epochs, reached, out = np.array([19, 39, 57]), np.array([20, 40, 58]), np.empty((5, 30), np.int64)
-        n = in_order(epochs, reached, depth, views, 10, 60, 5, 5, interval_ns, is_planar, out)
+        n = in_order(epochs, reached, depth, seen, outcome, 10, 60, 5, 5, interval_ns, is_planar, out)
         return list(map(tuple, out[:, :n].T.tolist()))
 
     expected = [
