@@ -40,7 +40,7 @@ SINGULAR_COSINE = 1e-3
 
 @compiled
 def advance(
-    x: Floats, P: Floats, i_R_j: Floats, impulse: Floats, earth: Floats, port: Floats,
+    x: Floats, P: Floats, i_R_j: Floats, impulse: Floats, earth: Floats, port: Floats, depth_variance: float,
     body_R_sonar: Floats, body_p_sonar: Floats, gate: float, events: Events, k: int,
 ) -> int:  # fmt: skip
     """Use events from k on, up to a gap, a landmark that is new or may be far, or an event of another kind."""
@@ -59,7 +59,8 @@ def advance(
             if not math.isnan(up[0]):
                 correct_up(x, P, up, events.gravity[row, 7])
         elif kind == DEPTH:
-            correct_depth(x, P, dR[k], dp[k], C[k], port, events.z_m[row], events.variance_m2[row])
+            variance_m2 = depth_variance if math.isnan(events.variance_m2[row]) else events.variance_m2[row]
+            correct_depth(x, P, dR[k], dp[k], C[k], port, events.z_m[row], variance_m2)
         elif kind == FRAME:
             while row < len(events.seen_ns) and events.seen_ns[row] == events.stamp_ns[k]:
                 if events.outcome[row] == ACCEPTED:
@@ -131,7 +132,18 @@ class EkfSlam(FilterShell):
         EstimatorError
             When the pitch comes so near 90 degrees that the Euler angles are singular.
         """
-        k = advance(self._x, self._P, self.turned, self.impulse, self.earth, self.port, *self.sonar[:3], events, k)
+        k = advance(
+            self._x,
+            self._P,
+            self.turned,
+            self.impulse,
+            self.earth,
+            self.port,
+            self.depth_variance,
+            *self.sonar[:3],
+            events,
+            k,
+        )
         if math.cos(self._x[4]) < SINGULAR_COSINE:
             raise EstimatorError(
                 f"ekf-slam: pitch is {math.degrees(self._x[4]):.2f} deg at {events.start_ns[k]} ns, where the Euler"

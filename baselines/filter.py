@@ -146,7 +146,7 @@ class Events(NamedTuple):
     has_rate: NDArray[np.bool_]
     """True where a gyro bias and the Earth's rate are still in a motion."""
     z_m: Floats
-    """Depth samples, with their variances."""
+    """Depth samples, with their variances; NaN: that of the calibration."""
     variance_m2: Floats
     gravity: Floats
     """Intervals of gravity: velocity of the IMU's point at both ends, duration, and sigma of the tilt, shape (g, 8)."""
@@ -244,6 +244,7 @@ class SonarModel(NamedTuple):
     floor_z_m: float
     """NaN where it is not known."""
     floor_variance_m2: float
+    body_T_sonar: gtsam.Pose3
 
     @classmethod
     def of(cls, calibration: Calibration, gate_probability: float) -> "SonarModel":
@@ -257,12 +258,12 @@ class SonarModel(NamedTuple):
             R_z=np.diag([sonar.range_sigma_m**2, sonar.azimuth_sigma_rad**2]),
             floor_z_m=floor.z_m if floor else math.nan,
             floor_variance_m2=floor.sigma_m**2 if floor else math.nan,
+            body_T_sonar=sonar.mounting.pose(),
         )
 
     def elevation_of_new(self, R: Floats, X: Floats, z: Floats) -> float:
         """Elevation of a new landmark seen from a body: on the floor, or 0 without a floor within the aperture."""
-        body_T_sonar = gtsam.Pose3(gtsam.Rot3(self.body_R_sonar), self.body_p_sonar)
-        world_T_sonar = gtsam.Pose3(gtsam.Rot3(R), X).compose(body_T_sonar)
+        world_T_sonar = gtsam.Pose3(gtsam.Rot3(R), X).compose(self.body_T_sonar)
         return elevation_on_floor(world_T_sonar, z[0], z[1], self.floor_z_m, self.aperture_rad) or 0.0
 
 
@@ -347,7 +348,7 @@ class FilterShell(ABC):
         self.port = np.array(calibration.depth.port_m)
         self._minimum_id_probability, earth = params.minimum_id_probability, earth_rate_in_world(calibration)
         self.earth, self._has_rate = np.zeros(3) if earth is None else earth, self.has_bias or earth is not None
-        self._plane, self._depth_variance = calibration.planar, calibration.depth.sigma_m**2
+        self._plane, self.depth_variance = calibration.planar, calibration.depth.sigma_m**2
         self._interval_ns = round(params.gravity_interval_s * 1e9) if calibration.use_gravity else 0
         self.node_ns = 0
         """Stamp of the newest epoch, that of the state."""
@@ -522,8 +523,7 @@ class FilterShell(ABC):
         epochs_ns = self.odometry.epochs(self.node_ns, end_ns)
         depth_ns, z_m, variance_m2 = NO_STAMPS, NO_DEPTH, NO_DEPTH
         if depth is not None:
-            depth_ns, z_m = depth.stamps_ns, depth.z_m
-            variance_m2 = np.where(np.isnan(depth.variance_m2), self._depth_variance, depth.variance_m2)
+            depth_ns, z_m, variance_m2 = depth.stamps_ns, depth.z_m, depth.variance_m2
         columns = np.empty((5, 3 * len(epochs_ns) + len(depth_ns) + len(views.stamp_ns) + 1), np.int64)
         reached_ns, is_planar = self.odometry.reached_ns(epochs_ns), self._plane is not None
         n = in_order(
@@ -532,7 +532,7 @@ class FilterShell(ABC):
         )  # fmt: skip
         stamp_ns, start_ns, until_ns, kind, row = columns[:, :n]
         motions = self.odometry.motions(start_ns, until_ns, stamp_ns, NO_BIAS)
-        gravity, has_rate = NO_GRAVITY, np.full(n, self._has_rate)
+        gravity, has_rate = NO_GRAVITY, np.ones(n, np.bool_) if self._has_rate else np.zeros(n, np.bool_)
         if GRAVITY in kind.tolist():
             gravity = self._gravity(until_ns[kind == GRAVITY].tolist())
         happening = stamp_ns, start_ns, until_ns, kind, row, *motions, has_rate

@@ -99,7 +99,10 @@ class InvariantEkf(FilterShell):
                 self.predict(motion, (events.end_ns[k] - events.start_ns[k]) * 1e-9)
                 add_force(self.turned, self.impulse, motion.dR, motion.impulse)
             else:
-                self.correct_depth(motion, events.z_m[row], events.variance_m2[row])
+                variance_m2 = events.variance_m2[row]
+                self.correct_depth(
+                    motion, events.z_m[row], self.depth_variance if np.isnan(variance_m2) else variance_m2
+                )
             k += 1
         return k
 

@@ -30,8 +30,9 @@ from sonar_graph.navigation.dvl_gaps import Sensors, Stretch, bridge, continued,
 from sonar_graph.navigation.dvl_screening import RowIntake
 from sonar_graph.navigation.imu_gaps import UNTURNED, turns_of
 from sonar_graph.navigation.samples import WINDOW_NS, finite_vector, no_doppler_stamp
-from sonar_graph.navigation.steps import Rows
+from sonar_graph.navigation.steps import Rows, rows_until
 from sonar_graph.navigation.sums import motions_over
+from sonar_graph.numerics import compiled
 from sonar_graph.states import RefusedRow
 
 ZERO = np.zeros(3)
@@ -128,19 +129,13 @@ class Odometry:
 
     def epochs(self, after_ns: int, until_ns: int) -> Ints:
         """Epochs after one instant that are reached at another, in order, shape (n,)."""
-        imu_ns, dvl_ns = self._imu.stamps_ns, self._dvl.stamps_ns
-        seen = imu_ns.searchsorted(until_ns, side="right")
-        if not seen:
-            return dvl_ns[:0]
-        known = self._dvl.values[2].searchsorted(until_ns, side="right")
-        last = min(known, dvl_ns.searchsorted(imu_ns[seen - 1], side="right"))
-        return dvl_ns[dvl_ns.searchsorted(after_ns, side="right") : last]
+        dvl_ns = self._dvl.stamps_ns
+        first, last = _epochs_between(after_ns, until_ns, self._imu.stamps_ns, dvl_ns, self._dvl.values[2])
+        return dvl_ns[first:last]
 
     def reached_ns(self, epochs_ns: Ints) -> Ints:
         """Instants at which epochs are reached: an IMU row covers them, and their velocities are known; shape (n,)."""
-        imu_ns, known_ns = self._imu.stamps_ns, self._dvl.values[2]
-        covered_ns = imu_ns[imu_ns.searchsorted(epochs_ns)]
-        return np.maximum(covered_ns, known_ns[self._dvl.stamps_ns.searchsorted(epochs_ns)])
+        return _reached(epochs_ns, self._imu.stamps_ns, self._dvl.stamps_ns, self._dvl.values[2])
 
     def is_gap(self, start_ns: int, end_ns: int) -> bool:
         """True for a time without Doppler rows that is too long for a linear velocity."""
@@ -243,6 +238,25 @@ class Odometry:
 def _joined(before: PreintegratedMotion | None, motion: PreintegratedMotion) -> PreintegratedMotion:
     """A motion, or none, followed by another."""
     return motion if before is None else before.then(motion)
+
+
+@compiled
+def _epochs_between(after_ns: int, until_ns: int, imu_ns: Ints, dvl_ns: Ints, known_ns: Ints) -> tuple[int, int]:
+    """First and last row (exclusive) of `Odometry.epochs`."""
+    seen = rows_until(imu_ns, until_ns)
+    if seen == 0:
+        return 0, 0
+    return rows_until(dvl_ns, after_ns), min(rows_until(known_ns, until_ns), rows_until(dvl_ns, imu_ns[seen - 1]))
+
+
+@compiled
+def _reached(epochs_ns: Ints, imu_ns: Ints, dvl_ns: Ints, known_ns: Ints) -> Ints:
+    """As `Odometry.reached_ns`."""
+    reached_ns = np.empty(len(epochs_ns), np.int64)
+    for k in range(len(epochs_ns)):
+        before_ns = epochs_ns[k] - 1
+        reached_ns[k] = max(imu_ns[rows_until(imu_ns, before_ns)], known_ns[rows_until(dvl_ns, before_ns)])
+    return reached_ns
 
 
 def _in_frame(motion: PreintegratedMotion | None, earth: Floats) -> Floats:

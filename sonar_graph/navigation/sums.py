@@ -38,6 +38,8 @@ from sonar_graph.numerics import (
 )
 
 NOWHERE = Vec3(np.nan, np.nan, np.nan)
+
+
 START = np.zeros((20, 3))
 """Sums of no steps: R, p and impulse; blocks tt, rt and rr of C_i (rotation, lower left, translation); those of D_i."""
 START[:3] = np.eye(3)
@@ -61,12 +63,12 @@ def motions_over(
     ``longest_ns`` between Doppler samples is all NaN. ``sums``, shape (20 n, 3): those up to the starts, to be
     continued in place, the parts of `START` in their order, each for all intervals; None: of no steps.
     """
-    n = len(start_ns)
-    if sums is None:
-        sums = np.zeros((20 * n, 3))
-        sums[: 3 * n].reshape(n, 3, 3)[:] = START[:3]
+    n, is_new = len(start_ns), sums is None
+    sums = np.zeros((20 * n, 3)) if sums is None else sums
     C, D = np.empty((6 * n, 6)), np.empty((6 * n, 3))
-    _write_motions(rows, start_ns, end_ns, known_ns, longest_ns, bias, earth, body_p_dvl, gyro_density, sums, C, D)
+    _write_motions(
+        rows, start_ns, end_ns, known_ns, longest_ns, bias, earth, body_p_dvl, gyro_density, is_new, sums, C, D
+    )
     dR, dp, impulse = sums[: 3 * n].reshape(n, 3, 3), sums[3 * n : 4 * n], sums[4 * n : 5 * n]
     return Motions(dR, dp, C.reshape(n, 6, 6), D.reshape(n, 6, 3), impulse)
 
@@ -82,6 +84,7 @@ def _write_motions(
     earth: Floats,
     body_p_dvl: Floats,
     gyro_density: float,
+    is_new: bool,
     sums: Floats,
     C: Floats,
     D: Floats,
@@ -93,7 +96,7 @@ def _write_motions(
         i, k = rows_until(rows.imu_ns, t), rows_until(rows.dvl_ns, t)
         imu_rows, dvl_rows = rows_until(rows.imu_ns, known_ns[e]), max(rows_until(rows.known_ns, known_ns[e]), 1)
         at = 5 * n + 3 * e
-        R, p, f = mat(sums, 3 * e, 0), row(sums, 3 * n + e), row(sums, 4 * n + e)
+        R, p, f = I3 if is_new else mat(sums, 3 * e, 0), row(sums, 3 * n + e), row(sums, 4 * n + e)
         tt, rt, rr = mat(sums, at, 0), mat(sums, at + 3 * n, 0), mat(sums, at + 6 * n, 0)
         D_t, D_r = mat(sums, at + 9 * n, 0), mat(sums, at + 12 * n, 0)
         if has_gap(rows.dvl_ns, dvl_rows, k, t, end, longest_ns):
