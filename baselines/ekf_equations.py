@@ -15,7 +15,7 @@ the pose after the motion, in the body's own axes, to which state and motion con
                                             [ dR^T R^T   -dR^T [dp]x W     ]
 
 A point q of the body moves by ``R' (rho - [q]x theta)``: along a direction n, in body axes, ``H_b = [(q x n)^T, n^T]``.
-W, E: `sonar_graph.numerics.matrices`. Derivation and the choices the paper leaves open: docs/theory/ekf_slam.md.
+W, E: `sonar_graph.numerics.matrices`. Derivation and choices that the paper leaves open: docs/theory/ekf_slam.md.
 """
 
 import math
@@ -49,7 +49,6 @@ from sonar_graph.slam.models import FLOOR_GATE, sonar_point, sonar_point_jacobia
 
 POSE, LANDMARK = 6, 3
 """Lengths of x_v and of p_i."""
-
 
 # -------------------------------------------------------------------------------- prediction
 
@@ -160,8 +159,7 @@ def location(
     R, X, T = body_after(x, motion.dR, motion.dp)
     q = sonar.body_p_sonar + sonar.body_R_sonar @ sonar_point(z[0], z[1], elevation_rad)
     minus_q_x = np.array([[0.0, q[2], -q[1]], [-q[2], 0.0, q[0]], [q[1], -q[0], 0.0]])
-    G_b = np.empty((3, 6))
-    G_b[:, :3], G_b[:, 3:] = R @ minus_q_x, R
+    G_b = np.concatenate((R @ minus_q_x, R), axis=1)
     return X + R @ q, G_b @ T, G_b, R @ sonar.body_R_sonar @ sonar_point_jacobian(z[0], z[1], elevation_rad)
 
 
@@ -245,9 +243,8 @@ def augment(x: Floats, P: Floats, motion: Motion, sonar: SonarModel, z: Floats, 
     p, G_v, G_b, G_z = location(x, motion, sonar, z, sonar.elevation_of_new(R, X, z))
     P_pv = G_v @ P[:POSE]
     P_pp = P_pv[:, :POSE] @ G_v.T + G_b @ motion.C @ G_b.T + G_z @ polar_covariance(R_z, sonar.aperture_rad) @ G_z.T
-    n = len(x)
-    x, P_vm, P = np.concatenate([x, p]), P, np.empty((n + LANDMARK, n + LANDMARK))
-    P[:n, :n], P[n:, :n], P[:n, n:], P[n:, n:] = P_vm, P_pv, P_pv.T, 0.5 * (P_pp + P_pp.T)
+    P_p = np.concatenate((P_pv, 0.5 * (P_pp + P_pp.T)), axis=1)
+    x, P = np.concatenate((x, p)), np.concatenate((np.concatenate((P, P_pv.T), axis=1), P_p))
     if (sonar.floor_z_m - x[-1]) ** 2 <= FLOOR_GATE * (P[-1, -1] + sonar.floor_variance_m2):
         correct_number(x, P, len(x) - 1, sonar.floor_z_m, sonar.floor_variance_m2)
     return x, P

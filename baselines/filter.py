@@ -415,8 +415,6 @@ class FilterShell(ABC):
 
         Raises
         ------
-        MeasurementError
-            When a row is stamped after ``end_ns``.
         EstimatorError
             When the state has no meaning any more, or a variance makes an innovation's covariance not positive.
         """
@@ -498,12 +496,11 @@ class FilterShell(ABC):
             if kinds[k] == PLANE and self._plane is not None:
                 self.correct_plane(self._plane)
             else:
+                if math.isnan(events.dp[k, 0]):
+                    self._bridge(events, k)
                 used_until = self.advance(events, k)
                 if used_until > k:
                     k = used_until
-                    continue
-                if math.isnan(events.dp[k, 0]):
-                    self._bridge(events, k)
                     continue
                 self._see(ids, self.motion_to(events, k), views, int(events.row[k]))
             k += 1
@@ -572,11 +569,8 @@ class FilterShell(ABC):
             self._in_gap[start_ns, kind] = count = self._in_gap.get((start_ns, kind), 0) + more
             C *= count * (count + 1)
         self._was_lost, events.has_rate[k], events.landmark[:] = True, False, -1
-        pose, impulse = over.i_T_j, over.mean_specific_force * over.duration_s
-        for column, value in zip(
-            events[5:10], (pose.rotation().matrix(), pose.translation(), C, D, impulse), strict=True
-        ):
-            column[k] = value
+        events.dR[k], events.dp[k] = over.i_T_j.rotation().matrix(), over.i_T_j.translation()
+        events.C[k], events.D[k], events.impulse[k] = C, D, over.mean_specific_force * over.duration_s
 
     def _see(self, ids: Ints, motion: Motion, views: Views, first: int) -> None:
         """Update by the landmarks of a frame, or append them at first sight."""

@@ -183,12 +183,12 @@ class Odometry:
         k, i = int(dvl_ns.searchsorted(epoch_ns)), int(imu_ns.searchsorted(epoch_ns))
         if k == len(dvl_ns) or dvl_ns[k] != epoch_ns:
             raise no_doppler_stamp("epoch_ns", epoch_ns, dvl_ns)
-        a, b, c = rates[min(i, len(rates) - 1)].tolist()
+        x, y, z = rates[min(i, len(rates) - 1)].tolist()
         if 0 < i < len(rates) and not self._hold_past:
-            a_0, b_0, c_0 = rates[i - 1].tolist()
+            x_0, y_0, z_0 = rates[i - 1].tolist()
             share = float((epoch_ns - imu_ns[i - 1]) / (imu_ns[i] - imu_ns[i - 1]))
-            a, b, c = a_0 + share * (a - a_0), b_0 + share * (b - b_0), c_0 + share * (c - c_0)
-        x, y, z = self._dvl_p_imu
+            x, y, z = x_0 + share * (x - x_0), y_0 + share * (y - y_0), z_0 + share * (z - z_0)
+        a, b, c = self._dvl_p_imu
         swing = y * c - z * b, z * a - x * c, x * b - y * a
         return velocity[k] + swing, float(cov[k, 0, 0] + cov[k, 1, 1] + cov[k, 2, 2]) / 3.0
 
