@@ -90,9 +90,8 @@ def body_after(x: Floats, dR_: Floats, dp_: Floats) -> tuple[Floats, Floats, Flo
 @compiled
 def pose_after(x: Floats, P: Floats, dR: Floats, dp: Floats, C: Floats) -> tuple[Floats, Floats, Floats]:
     """Pose of the body a motion after the state: R' (3, 3), X' (3,), and the covariance ``T P_vv T^T + C`` of delta."""
-    (R, X, T_), out = body_after(x, dR, dp), np.empty((6, 6))
-    T = mat6(T_)
-    store6(T @ mat6(P) @ T.T + mat6(C), out)
+    (R, X, T), out = body_after(x, dR, dp), np.empty((6, 6))
+    store6(mat6(T) @ mat6(P) @ mat6(T).T + mat6(C), out)
     return R, X, out
 
 
@@ -116,11 +115,11 @@ def add_row(h: Vec3, P: Floats, at: int, U: Floats, r: int) -> None:
 @compiled
 def observe(
     x: Floats, P: Floats, at: int, dR_: Floats, dp_: Floats, C: Floats,
-    body_R_sonar: Floats, body_p_sonar: Floats, z: Floats, R_z: Floats, gate: float,
-) -> tuple[bool, Floats, Floats]:  # fmt: skip
+    body_R_sonar: Floats, body_p_sonar: Floats, z: Floats, R_z: Floats, gate: float, e: Floats, S: Floats,
+) -> bool:  # fmt: skip
     """Update by range and azimuth of the landmark at ``x[at : at + 3]``, where its innovation is inside the gate.
 
-    Returns whether it was used, e of (7) and its covariance ``S = H P H^T + H_b C H_b^T + R_z``.
+    Returns whether it was used, and writes e of (7) and its covariance ``S = H P H^T + H_b C H_b^T + R_z``.
     """
     dR, dp, angles = mat(dR_), vec(dp_), vec(x[3:])
     R, W, B = rotation_from_euler(angles), body_rates_from_euler(angles), mat(body_R_sonar)
@@ -128,24 +127,24 @@ def observe(
     q = B.T @ (p_b - vec(body_p_sonar))
     level2 = q.x**2 + q.y**2
     r = math.sqrt(level2 + q.z**2)
-    e, U, S = np.empty(2), np.zeros((2, len(x))), R_z.copy()
     e[0], e[1] = z[0] - r, wrap_angle(z[1] - math.atan2(q.y, q.x))  # (6), (7)
     along = B @ ((1.0 / r) * q), B @ Vec3(-q.y / level2, q.x / level2, 0.0)  # p_b moves, range and azimuth grow
     H_b = Vec6(cross(along[0], p_b), -1.0 * along[0]), Vec6(cross(along[1], p_b), -1.0 * along[1])
-    H_v = by_state(H_b[0], R, W, dR, dp), by_state(H_b[1], R, W, dR, dp)
+    H_v, U = (by_state(H_b[0], R, W, dR, dp), by_state(H_b[1], R, W, dR, dp)), np.zeros((2, len(x)))
     for a in range(2):
         add_row(H_v[a].a, P, 0, U, a)
         add_row(H_v[a].b, P, 3, U, a)
         add_row(-1.0 * H_v[a].a, P, at, U, a)
     for a in range(2):
         for b in range(2):
-            along_X = Vec3(U[b, 0] - U[b, at], U[b, 1] - U[b, at + 1], U[b, 2] - U[b, at + 2])
-            S[a, b] += H_v[a].a @ along_X + H_v[a].b @ Vec3(U[b, 3], U[b, 4], U[b, 5]) + H_b[a] @ (mat6(C) @ H_b[b])
+            U_X = Vec3(U[b, 0] - U[b, at], U[b, 1] - U[b, at + 1], U[b, 2] - U[b, at + 2])
+            U_v = Vec6(U_X, Vec3(U[b, 3], U[b, 4], U[b, 5]))
+            S[a, b] = R_z[a, b] + (H_v[a] @ U_v + H_b[a] @ (mat6(C) @ H_b[b]))
     S[1, 0] = S[0, 1]
     is_used = is_inside(e, S, gate)
     if is_used:
         correct(x, P, U, S, e)
-    return is_used, e, S
+    return is_used
 
 
 def location(
@@ -208,8 +207,9 @@ def correct_number(x: Floats, P: Floats, k: int, value: float, variance: float) 
 def correct_up(x: Floats, P: Floats, up: Floats, sigma: float) -> None:
     """Update roll and pitch by the direction of the world's up in the body, with the sigma of its tilt (rad)."""
     level = math.hypot(up[1], up[2])
-    correct_number(x, P, 3, math.atan2(up[1], up[2]), (sigma / level) ** 2)
-    correct_number(x, P, 4, math.atan2(-up[0], level), sigma**2)
+    measured, sigmas = (math.atan2(up[1], up[2]), math.atan2(-up[0], level)), (sigma / level, sigma)
+    for k in range(2):
+        correct_number(x, P, 3 + k, measured[k], sigmas[k] ** 2)
 
 
 @compiled

@@ -24,7 +24,7 @@ from baselines.filter import (
     FilterShell,
     Motion,
     add_force,
-    corrected,
+    remove_rate,
     up_at_end,
 )
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
@@ -49,7 +49,7 @@ def advance(
         kind, row = events.kind[k], events.row[k]
         if events.has_rate[k]:
             earth_i = rotation_from_euler(vec(x[3:])).T @ vec(earth)
-            dR[k], dp[k], force[k] = corrected(dR[k], dp[k], D[k], force[k], NO_BIAS, earth_i)
+            remove_rate(dR[k], dp[k], D[k], force[k], NO_BIAS, earth_i)
             events.has_rate[k] = False
         if kind == EPOCH:
             predict(x, P, dR[k], dp[k], C[k])
@@ -66,9 +66,9 @@ def advance(
                 if events.outcome[row] == ACCEPTED:
                     if events.landmark[row] < 0:
                         return k
-                    is_used, events.e[row], events.S[row] = observe(
-                        x, P, POSE + LANDMARK * events.landmark[row], dR[k], dp[k], C[k],
-                        body_R_sonar, body_p_sonar, events.z[row], events.R_z[row], gate,
+                    is_used = observe(
+                        x, P, POSE + LANDMARK * events.landmark[row], dR[k], dp[k], C[k], body_R_sonar, body_p_sonar,
+                        events.z[row], events.R_z[row], gate, events.e[row], events.S[row],
                     )  # fmt: skip
                     events.outcome[row] = USED if is_used else GATED
                 row += 1
@@ -165,7 +165,8 @@ class EkfSlam(FilterShell):
         if may_be_far and (told := ekf_equations.observe_far(self._x, self._P, at, motion, sonar, z, R_z)) is not None:
             return told
         dR, dp, C, _, _ = motion
-        return observe(self._x, self._P, at, dR, dp, C, sonar.body_R_sonar, sonar.body_p_sonar, z, R_z, sonar.gate)
+        e, S, place = np.empty(2), np.empty((2, 2)), (sonar.body_R_sonar, sonar.body_p_sonar)
+        return observe(self._x, self._P, at, dR, dp, C, *place, z, R_z, sonar.gate, e, S), e, S
 
     def augment(self, motion: Motion, z: Floats, R_z: Floats) -> None:
         """Append a landmark to (4) and (5)."""

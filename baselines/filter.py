@@ -63,22 +63,18 @@ class Motion(Motions):
 
 
 @compiled
-def corrected(
-    dR_: Floats, dp_: Floats, D: Floats, impulse: Floats, bias: Floats, earth: Floats
-) -> tuple[Floats, Floats, Floats]:
-    """dR, dp and impulse without a gyro bias and the Earth's rate, to first order.
+def remove_rate(dR: Floats, dp: Floats, D: Floats, impulse: Floats, bias: Floats, earth: Floats) -> None:
+    """Remove a gyro bias and the Earth's rate (frame i, rad/s) from dR, dp and impulse, to first order.
 
-    ``earth`` is the Earth's rate in frame i, rad/s. To gyros it is a bias, the mean of that in both frames, i and j;
-    the specific force is turned by half of what the body is.
+    To gyros the Earth's rate is a bias, the mean of that in both frames, i and j; the specific force is turned by half
+    of what the body is.
     """
-    dR, dp = mat(dR_), vec(dp_)
-    rate = vec(bias) + 0.5 * (vec(earth) + dR.T @ vec(earth))
+    R, p, f, rate_i = mat(dR), vec(dp), vec(impulse), vec(earth)
+    rate = vec(bias) + 0.5 * (rate_i + R.T @ rate_i)
     theta, rho = mat(D) @ rate, mat(D, 3, 0) @ rate
-    turned, moved, pushed = np.empty((3, 3)), np.empty(3), np.empty(3)
-    store(dR @ exp_and_mean(theta)[0], turned, 0, 0)
-    moved[0], moved[1], moved[2] = dp + dR @ rho
-    pushed[0], pushed[1], pushed[2] = vec(impulse) + 0.5 * cross(dR @ theta, vec(impulse))
-    return turned, moved, pushed
+    store(R @ exp_and_mean(theta)[0], dR, 0, 0)
+    dp[0], dp[1], dp[2] = p + R @ rho
+    impulse[0], impulse[1], impulse[2] = f + 0.5 * cross(R @ theta, f)
 
 
 @compiled
@@ -548,10 +544,12 @@ class FilterShell(ABC):
 
     def motion_to(self, events: Events, k: int) -> Motion:
         """Motion to an event, without the gyro bias of the state and the Earth's rate."""
-        dR, dp, C, D, impulse = (column[k] for column in events[5:10])
+        motion = Motion(*(column[k] for column in events[5:10]))
         if events.has_rate[k]:
-            dR, dp, impulse = corrected(dR, dp, D, impulse, self.gyro_bias(), self.attitude().T @ self.earth)
-        return Motion(dR, dp, C, D, impulse)
+            dR, dp, _, D, impulse = motion
+            remove_rate(dR, dp, D, impulse, self.gyro_bias(), self.attitude().T @ self.earth)
+            events.has_rate[k] = False
+        return motion
 
     def _bridge(self, events: Events, k: int) -> None:
         """Write the motion over a gap, with the share of its error that the measurements of one more event may have.

@@ -34,7 +34,7 @@ def gravity_direction(
     ``motion`` leads from epoch i to epoch j; the velocities are of the IMU's point in body axes at both, shape (3,),
     m/s, each component with ``sigma_m_s``. None where the specific force was not measured.
     """
-    i_R_j = motion.i_T_j.rotation().matrix()
+    i_R_j = np.ascontiguousarray(motion.i_T_j.rotation().matrix())
     up_j = up_direction(motion.mean_specific_force, i_R_j, velocity_i, velocity_j, motion.duration_s)
     if not np.isfinite(up_j).all():
         return None
