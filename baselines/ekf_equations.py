@@ -103,10 +103,11 @@ def by_state(H_b: Vec6, R: Mat3, W: Mat3, dR: Mat3, dp: Vec3) -> Vec6:
 
 
 @inlined
-def add_row(h: Vec3, P: Floats, at: int, U: Floats, r: int) -> None:
-    """``U[r] += h^T P[at : at + 3]``."""
+def write_row(H_v: Vec6, P: Floats, U: Floats, r: int) -> None:
+    """``U[r] = H_v P_v.``."""
+    a, b = H_v
     for i in range(len(P)):
-        U[r, i] += h.x * P[at, i] + h.y * P[at + 1, i] + h.z * P[at + 2, i]
+        U[r, i] = a.x * P[0, i] + a.y * P[1, i] + a.z * P[2, i] + (b.x * P[3, i] + b.y * P[4, i] + b.z * P[5, i])
 
 
 # -------------------------------------------------------------------------------- observation and innovation
@@ -130,11 +131,11 @@ def observe(
     e[0], e[1] = z[0] - r, wrap_angle(z[1] - math.atan2(q.y, q.x))  # (6), (7)
     along = B @ ((1.0 / r) * q), B @ Vec3(-q.y / level2, q.x / level2, 0.0)  # p_b moves, range and azimuth grow
     H_b = Vec6(cross(along[0], p_b), -1.0 * along[0]), Vec6(cross(along[1], p_b), -1.0 * along[1])
-    H_v, U = (by_state(H_b[0], R, W, dR, dp), by_state(H_b[1], R, W, dR, dp)), np.zeros((2, len(x)))
+    H_v, U = (by_state(H_b[0], R, W, dR, dp), by_state(H_b[1], R, W, dR, dp)), np.empty((2, len(x)))
     for a in range(2):
-        add_row(H_v[a].a, P, 0, U, a)
-        add_row(H_v[a].b, P, 3, U, a)
-        add_row(-1.0 * H_v[a].a, P, at, U, a)
+        write_row(H_v[a], P, U, a)
+        for i in range(len(P)):
+            U[a, i] -= H_v[a].a @ Vec3(P[at, i], P[at + 1, i], P[at + 2, i])
     for a in range(2):
         for b in range(2):
             U_X = Vec3(U[b, 0] - U[b, at], U[b, 1] - U[b, at + 1], U[b, 2] - U[b, at + 2])
@@ -222,9 +223,8 @@ def correct_depth(
     up = (R @ dR).z
     H_b = Vec6(cross(q, up), up)
     H_v = by_state(H_b, R, W, dR, dp)
-    U, S, e = np.zeros((1, len(x))), np.empty((1, 1)), np.empty(1)
-    add_row(H_v.a, P, 0, U, 0)
-    add_row(H_v.b, P, 3, U, 0)
+    U, S, e = np.empty((1, len(x))), np.empty((1, 1)), np.empty(1)
+    write_row(H_v, P, U, 0)
     share = H_v.a @ Vec3(U[0, 0], U[0, 1], U[0, 2]) + H_v.b @ Vec3(U[0, 3], U[0, 4], U[0, 5])
     S[0, 0] = share + H_b @ (mat6(C) @ H_b) + variance
     e[0] = z_m - (x[2] + R.z @ dp + up @ q)
