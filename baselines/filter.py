@@ -498,6 +498,8 @@ class FilterShell(ABC):
                 if used_until > k:
                     k = used_until
                     continue
+                if kinds[k] != FRAME:
+                    raise EstimatorError(f"{self.name}: the motion to {events.end_ns[k]} ns over a gap is not finite")
                 self._see(ids, self.motion_to(events, k), views, int(events.row[k]))
             k += 1
         if math.isnan(events.dp[k, 0]):
@@ -566,7 +568,9 @@ class FilterShell(ABC):
             more = 1 if kind == DEPTH else len(accepted_rows(events.seen_ns, events.outcome, row))
             self._in_gap[start_ns, kind] = count = self._in_gap.get((start_ns, kind), 0) + more
             C *= count * (count + 1)
-        self._was_lost, events.has_rate[k], events.landmark[:] = True, False, -1
+        events.has_rate[k] = False
+        if kind != END:  # asking for an estimate changes nothing
+            self._was_lost, events.landmark[:] = True, -1
         events.dR[k], events.dp[k] = over.i_T_j.rotation().matrix(), over.i_T_j.translation()
         events.C[k], events.D[k], events.impulse[k] = C, D, over.mean_specific_force * over.duration_s
 

@@ -230,6 +230,43 @@ def test_causal_estimates_keep_the_later_answer_and_time_never_runs_back():
 
 
 @slam_filters
+def test_gravity_keeps_a_turning_vehicle_level(kind):
+    """On a level circle, over many intervals of gravity; each is in the frame of its own start."""
+    rate, speed = 0.5, 1.0
+    rows = imu(10, (0.0, 0.0, rate), (0.0, rate * speed, 9.80665)), dvl(10, (speed, 0.0, 0.0))
+    level = Calibration(start=Start(rpy_sigma_rad=(0.1, 0.1, 0.1)))
+    tilts = []
+    for calibration in (level, level.model_copy(update={"use_gravity": False})):
+        slam = begun(kind, calibration)
+        slam.process(Measurements(later(10.0), *rows))
+        R = slam.attitude()
+        assert np.abs(R[2, :2]).max() < 1e-4
+        tilts.append(np.sqrt(height_and_tilt(slam)[2]).max())
+    assert tilts[0] < 0.2 * tilts[1]
+
+
+@slam_filters
+def test_a_question_while_beams_are_few_changes_nothing_later(kind):
+    """A call that ends before few-beam rows are completed sees a gap where later there is none."""
+    velocity = dvl(12, (0.3, 0.0, 0.0))
+    cov = np.tile(np.eye(3), (len(velocity), 1, 1))
+    cov[25:36, 2, 2] = np.inf
+    rows, views = (imu(12), replace(velocity, velocity_cov=cov)), seen(later(1.0, 3.0, 9.0, 10.0, 11.5), range_m=3.0)
+    precise = Calibration(sonar=SonarCalibration(range_sigma_m=1e-3, azimuth_sigma_rad=1e-3))
+    states = []
+    for cuts in ((12.0,), (7.0, 12.0), (6.1, 6.9, 12.0)):
+        slam, before_ns = begun(kind, precise, gate_probability=1.0), T0_NS - 1
+        for end_ns in (later(cut) for cut in cuts):
+            parts = [block.between(before_ns, end_ns) for block in (*rows, views)]
+            slam.process(Measurements(end_ns, parts[0], parts[1], None, parts[2]))
+            before_ns = end_ns
+        states.append((*state_of(slam), slam.detections().innovation_covs))
+    for other in states[1:]:
+        for part, same in zip(other, states[0], strict=True):
+            assert_array_equal(part, same)
+
+
+@slam_filters
 def test_each_detection_has_its_outcome_and_a_refused_one_changes_nothing(kind):
     """Before the first node, without a probable identity, older than what is done, and outside the gate."""
     slam = begun(kind, Calibration())
