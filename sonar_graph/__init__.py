@@ -12,7 +12,8 @@ From a log to a report::
 
 The rooms: `sonar_graph.navigation` (motion from IMU and DVL), `sonar_graph.slam` (models, factors, iSAM2),
 `sonar_graph.sonar` (recognition in images), `sonar_graph.simulation`, `sonar_graph.evaluation` (scores),
-`sonar_graph.testing` (checks for your own estimators and factors). Filters are in the package `baselines`.
+`sonar_graph.testing` (checks for your own estimators and factors). Filters: `baselines.ekf_slam`,
+`baselines.invariant_ekf`, `baselines.dead_reckoning`.
 
 Conventions
 -----------

@@ -152,12 +152,16 @@ class Odometry:
         Raises
         ------
         MeasurementError
-            When the instants are in the wrong order, the first lies before all rows, or the bias is no finite vector.
+            When the instants are no integers or in the wrong order, the first lies before all rows, or the bias is no
+            finite vector.
         """
         bias = finite_vector("bias", bias, 3)
         imu_ns, dvl_ns = self._imu.stamps_ns, self._dvl.stamps_ns
         if not (len(imu_ns) and len(dvl_ns)):
             raise MeasurementError("motion: needs rows of IMU and Doppler log; add them first")
+        for name, instant in (("start_ns", start_ns), ("end_ns", end_ns)):
+            if not isinstance(instant, int | np.integer):
+                raise MeasurementError(f"{name}: expected integer nanoseconds, not {instant!r}; take the stamp of a row")
         if end_ns < start_ns:
             raise MeasurementError(f"interval: ends at {end_ns} ns, before its start {start_ns}; the earlier first")
         if start_ns < (first_ns := max(imu_ns[0], dvl_ns[0])):

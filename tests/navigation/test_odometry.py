@@ -176,6 +176,8 @@ def test_what_bounds_no_motion_is_named():
     ):
         with pytest.raises(MeasurementError, match=message):
             odometry.motion(at(start_s), at(end_s), ZERO)
+    with pytest.raises(MeasurementError, match="end_ns: expected integer nanoseconds, not "):
+        odometry.motion(at(0.2), float(at(1.0)), ZERO)
     for bias, message in ((np.zeros(6), r"expected shape \(3,\), not \(6,\)"), ([0, np.nan, 0], "expected finite")):
         with pytest.raises(MeasurementError, match=f"bias: {message}"):
             odometry.motion(at(0.2), at(1.0), bias)
