@@ -161,7 +161,9 @@ class Odometry:
             raise MeasurementError("motion: needs rows of IMU and Doppler log; add them first")
         for name, instant in (("start_ns", start_ns), ("end_ns", end_ns)):
             if not isinstance(instant, int | np.integer):
-                raise MeasurementError(f"{name}: expected integer nanoseconds, not {instant!r}; take the stamp of a row")
+                raise MeasurementError(
+                    f"{name}: expected integer nanoseconds, not {instant!r}; take the stamp of a row"
+                )
         if end_ns < start_ns:
             raise MeasurementError(f"interval: ends at {end_ns} ns, before its start {start_ns}; the earlier first")
         if start_ns < (first_ns := max(imu_ns[0], dvl_ns[0])):
