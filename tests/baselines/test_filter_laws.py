@@ -230,6 +230,21 @@ def test_causal_estimates_keep_the_later_answer_and_time_never_runs_back():
 
 
 @slam_filters
+def test_a_refused_row_of_a_frame_changes_nothing(kind):
+    """Beside an accepted one of a landmark in the state, before and after it."""
+    first, states = seen(later(0.4, 0.5)), []
+    both = replace(seen(later(0.8, 0.8, 0.8), 2.01), id_probability=np.array([[0.8], [0.9], [0.3]]))
+    for frame in (both, both.rows(slice(1, 2))):
+        slam = begun(kind, Calibration())
+        slam.process(Measurements(later(0.6), imu(0.6), dvl(0.6), None, first))
+        slam.process(Measurements(later(1.0), imu(1), dvl(1), None, frame))
+        states.append(state_of(slam))
+    assert slam.detections().outcomes[-1] is Outcome.USED
+    for part, same in zip(*states, strict=True):
+        assert_array_equal(part, same)
+
+
+@slam_filters
 def test_gravity_keeps_a_turning_vehicle_level(kind):
     """On a level circle, over many intervals of gravity; each is in the frame of its own start."""
     rate, speed = 0.5, 1.0
