@@ -73,26 +73,22 @@ def predict(x: Floats, P: Floats, dR_: Floats, dp_: Floats, C: Floats) -> None:
             P[r, c] = P[c, r]
 
 
-@compiled
-def body_after(x: Floats, dR_: Floats, dp_: Floats) -> tuple[Floats, Floats, Floats]:
-    """R' (3, 3), X' (3,) and T (6, 6) of the pose after a motion."""
+@inlined
+def after(x: Floats, dR_: Floats, dp_: Floats) -> tuple[Mat3, Vec3, Mat6]:
+    """R', X' and T of the pose after a motion."""
     dR, dp, angles = mat(dR_), vec(dp_), vec(x[3:])
     R, W = rotation_from_euler(angles), body_rates_from_euler(angles)
-    R_after, X_after, T = np.empty((3, 3)), np.empty(3), np.zeros((6, 6))
-    store(R @ dR, R_after, 0, 0)
-    X_after[0], X_after[1], X_after[2] = vec(x) + R @ dp
-    store(dR.T @ W, T, 0, 3)
-    store(dR.T @ R.T, T, 3, 0)
-    store(-1.0 * (dR.T @ skew(dp) @ W), T, 3, 3)
-    return R_after, X_after, T
+    return R @ dR, vec(x) + R @ dp, Mat6(O3, dR.T @ W, dR.T @ R.T, -1.0 * (dR.T @ skew(dp) @ W))
 
 
 @compiled
 def pose_after(x: Floats, P: Floats, dR: Floats, dp: Floats, C: Floats) -> tuple[Floats, Floats, Floats]:
     """Pose of the body a motion after the state: R' (3, 3), X' (3,), and the covariance ``T P_vv T^T + C`` of delta."""
-    (R, X, T), out = body_after(x, dR, dp), np.empty((6, 6))
-    store6(mat6(T) @ mat6(P) @ mat6(T).T + mat6(C), out)
-    return R, X, out
+    (R, X, T), R_after, X_after, cov = after(x, dR, dp), np.empty((3, 3)), np.empty(3), np.empty((6, 6))
+    store(R, R_after)
+    X_after[0], X_after[1], X_after[2] = X
+    store6(T @ mat6(P) @ T.T + mat6(C), cov)
+    return R_after, X_after, cov
 
 
 @inlined
@@ -103,11 +99,11 @@ def by_state(H_b: Vec6, R: Mat3, W: Mat3, dR: Mat3, dp: Vec3) -> Vec6:
 
 
 @inlined
-def write_row(H_v: Vec6, P: Floats, U: Floats, r: int) -> None:
-    """``U[r] = H_v P_v.``."""
+def write_row(H_v: Vec6, P: Floats, U_r: Floats) -> None:
+    """``U_r = H_v P_v.``."""
     a, b = H_v
     for i in range(len(P)):
-        U[r, i] = a.x * P[0, i] + a.y * P[1, i] + a.z * P[2, i] + (b.x * P[3, i] + b.y * P[4, i] + b.z * P[5, i])
+        U_r[i] = a.x * P[0, i] + a.y * P[1, i] + a.z * P[2, i] + (b.x * P[3, i] + b.y * P[4, i] + b.z * P[5, i])
 
 
 # -------------------------------------------------------------------------------- observation and innovation
@@ -133,7 +129,7 @@ def observe(
     H_b = Vec6(cross(along[0], p_b), -1.0 * along[0]), Vec6(cross(along[1], p_b), -1.0 * along[1])
     H_v, U = (by_state(H_b[0], R, W, dR, dp), by_state(H_b[1], R, W, dR, dp)), np.empty((2, len(x)))
     for a in range(2):
-        write_row(H_v[a], P, U, a)
+        write_row(H_v[a], P, U[a])
         for i in range(len(P)):
             U[a, i] -= H_v[a].a @ Vec3(P[at, i], P[at + 1, i], P[at + 2, i])
     for a in range(2):
@@ -149,18 +145,21 @@ def observe(
 
 
 def location(
-    x: Floats, motion: Motion, sonar: SonarModel, z: Floats, elevation_rad: float
+    x: Floats, motion: Motion, sonar: SonarModel, z: Floats, elevation_rad: float | None = None
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """The point ``g(x_v, z, elevation) = X' + R' q`` that a detection shows, and its derivatives.
+    """The point ``g(x_v, z, elevation) = X' + R' q`` that a detection shows, and its derivatives; None: on the floor.
 
     Returns g (3,); ``G_v = G_b T`` by x_v (3, 6); ``G_b = R' [-[q]x  I]`` by delta (3, 6); G_z by (range, azimuth,
     elevation) (3, 3).
     """
-    R, X, T = body_after(x, motion.dR, motion.dp)
+    R, X, (a, b, c, d) = (np.array(part) for part in after(x, motion.dR, motion.dp))
+    if elevation_rad is None:
+        elevation_rad = sonar.elevation_of_new(R, X, z)
     q = sonar.body_p_sonar + sonar.body_R_sonar @ sonar_point(z[0], z[1], elevation_rad)
     minus_q_x = np.array([[0.0, q[2], -q[1]], [-q[2], 0.0, q[0]], [q[1], -q[0], 0.0]])
     G_b = np.concatenate((R @ minus_q_x, R), axis=1)
-    return X + R @ q, G_b @ T, G_b, R @ sonar.body_R_sonar @ sonar_point_jacobian(z[0], z[1], elevation_rad)
+    G_z = R @ sonar.body_R_sonar @ sonar_point_jacobian(z[0], z[1], elevation_rad)
+    return X + R @ q, G_b @ np.block([[a, b], [c, d]]), G_b, G_z
 
 
 def observe_far(
@@ -224,7 +223,7 @@ def correct_depth(
     H_b = Vec6(cross(q, up), up)
     H_v = by_state(H_b, R, W, dR, dp)
     U, S, e = np.empty((1, len(x))), np.empty((1, 1)), np.empty(1)
-    write_row(H_v, P, U, 0)
+    write_row(H_v, P, U[0])
     share = H_v.a @ Vec3(U[0, 0], U[0, 1], U[0, 2]) + H_v.b @ Vec3(U[0, 3], U[0, 4], U[0, 5])
     S[0, 0] = share + H_b @ (mat6(C) @ H_b) + variance
     e[0] = z_m - (x[2] + R.z @ dp + up @ q)
@@ -239,8 +238,7 @@ def augment(x: Floats, P: Floats, motion: Motion, sonar: SonarModel, z: Floats, 
 
     ``P_pv = G_v P_v.``,  ``P_pp = G_v P_vv G_v^T + G_b C G_b^T + G_z diag(R_z, elevation_sigma^2) G_z^T``.
     """
-    R, X, _ = body_after(x, motion.dR, motion.dp)
-    p, G_v, G_b, G_z = location(x, motion, sonar, z, sonar.elevation_of_new(R, X, z))
+    p, G_v, G_b, G_z = location(x, motion, sonar, z)
     P_pv = G_v @ P[:POSE]
     P_pp = P_pv[:, :POSE] @ G_v.T + G_b @ motion.C @ G_b.T + G_z @ polar_covariance(R_z, sonar.aperture_rad) @ G_z.T
     P_p = np.concatenate((P_pv, 0.5 * (P_pp + P_pp.T)), axis=1)

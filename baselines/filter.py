@@ -28,7 +28,7 @@ from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats, Ints, LandmarkDetections, Measurements
 from sonar_graph.motion import Motions, MotionSource, require_source
 from sonar_graph.navigation.alignment import earth_rate_in_world, tilt_sigma, up_direction
-from sonar_graph.numerics import I3, ZERO, compiled, cross, exp_and_mean, mat, store, vec
+from sonar_graph.numerics import I3, LOWER_LEFT, ZERO, compiled, cross, exp_and_mean, mat, store, vec
 from sonar_graph.slam.landmarks import ACCEPTED, gate_threshold, identify
 from sonar_graph.slam.models import elevation_on_floor
 from sonar_graph.states import (
@@ -71,8 +71,8 @@ def remove_rate(dR: Floats, dp: Floats, D: Floats, impulse: Floats, bias: Floats
     """
     R, p, f, rate_i = mat(dR), vec(dp), vec(impulse), vec(earth)
     rate = vec(bias) + 0.5 * (rate_i + R.T @ rate_i)
-    theta, rho = mat(D) @ rate, mat(D, 3, 0) @ rate
-    store(R @ exp_and_mean(theta)[0], dR, 0, 0)
+    theta, rho = mat(D) @ rate, mat(D, LOWER_LEFT) @ rate
+    store(R @ exp_and_mean(theta)[0], dR)
     dp[0], dp[1], dp[2] = p + R @ rho
     impulse[0], impulse[1], impulse[2] = f + 0.5 * cross(R @ theta, f)
 
@@ -82,7 +82,7 @@ def add_force(i_R_j: Floats, impulse: Floats, dR: Floats, more: Floats) -> None:
     """Continue an interval of gravity by a motion: rotation, and specific force summed up in the frame of its start."""
     R = mat(i_R_j)
     impulse[0], impulse[1], impulse[2] = vec(impulse) + R @ vec(more)
-    store(R @ mat(dR), i_R_j, 0, 0)
+    store(R @ mat(dR), i_R_j)
 
 
 @compiled
@@ -92,7 +92,7 @@ def up_at_end(i_R_j: Floats, impulse: Floats, interval: Floats) -> Floats:
     for i in range(3):
         impulse[i] /= duration_s
     up = up_direction(impulse, i_R_j, interval[:3], interval[3:6], duration_s)
-    store(I3, i_R_j, 0, 0)
+    store(I3, i_R_j)
     impulse[0], impulse[1], impulse[2] = ZERO
     return up
 

@@ -85,8 +85,8 @@ def exponential(phi: Floats) -> tuple[Floats, Floats]:
     """``Exp(phi)`` and ``J_l(phi)``, shape (3, 3), of the first three numbers of an array."""
     Exp, J_l = np.empty((3, 3)), np.empty((3, 3))
     turn, mean = exp_and_mean(vec(phi))
-    store(turn, Exp, 0, 0)
-    store(mean, J_l, 0, 0)
+    store(turn, Exp)
+    store(mean, J_l)
     return Exp, J_l
 
 

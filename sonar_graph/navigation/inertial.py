@@ -114,7 +114,7 @@ def _write_sums(
     t, T = cuts_ns[0], (cuts_ns[m] - origin_ns) * 1e-9
     i = rows_until(imu_ns, t)
     for k in range(m):
-        store(R, R_cuts, 3 * k, 0)
+        store(R, R_cuts, (3 * k, 0))
         s += R @ row(jumps, k)
         z, slope, before, after = row(v_start, k), row(v_end, k) - row(v_start, k), O3, O3
         while t < cuts_ns[k + 1]:
@@ -155,9 +155,9 @@ def _write_sums(
             v, p, s, R = v + dv, p + dp, s + ds, R @ turn
             i += int(i < imu_rows and imu_ns[i] <= until)
             t = until
-        store(before, turned_s, 3 * k, 0)
-        store(after, turned_s, 3 * (m + k), 0)
-    store(R, R_cuts, 3 * m, 0)
+        store(before, turned_s, (3 * k, 0))
+        store(after, turned_s, (3 * (m + k), 0))
+    store(R, R_cuts, (3 * m, 0))
     nine(v, p, s + R @ row(jumps, m), whole)
 
 

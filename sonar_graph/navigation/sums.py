@@ -23,6 +23,7 @@ from sonar_graph.motion import Motions
 from sonar_graph.navigation.steps import Rows, has_gap, hole_from, put, row, rows_until, step_from
 from sonar_graph.numerics import (
     I3,
+    LOWER_LEFT,
     O3,
     Mat6,
     Vec3,
@@ -65,12 +66,12 @@ def motions_over(
     """
     n, is_new = len(start_ns), sums is None
     sums = np.zeros((20 * n, 3)) if sums is None else sums
-    C, D = np.empty((6 * n, 6)), np.empty((6 * n, 3))
+    C, D = np.empty((n, 6, 6)), np.empty((n, 6, 3))
     _write_motions(
         rows, start_ns, end_ns, known_ns, longest_ns, bias, earth, body_p_dvl, gyro_density, is_new, sums, C, D
     )
     dR, dp, impulse = sums[: 3 * n].reshape(n, 3, 3), sums[3 * n : 4 * n], sums[4 * n : 5 * n]
-    return Motions(dR, dp, C.reshape(n, 6, 6), D.reshape(n, 6, 3), impulse)
+    return Motions(dR, dp, C, D, impulse)
 
 
 @compiled
@@ -89,16 +90,16 @@ def _write_motions(
     C: Floats,
     D: Floats,
 ) -> None:
-    """Continue sums, and fill C and D of `Motions`; matrices one below the other (reshaping is slow to compile)."""
+    """Continue sums, and fill C and D of `Motions`."""
     n, b, E, arm, n2 = len(start_ns), vec(bias), vec(earth), vec(body_p_dvl), gyro_density**2 * I3
     for e in range(n):
         t, end = start_ns[e], end_ns[e]
         i, k = rows_until(rows.imu_ns, t), rows_until(rows.dvl_ns, t)
         imu_rows, dvl_rows = rows_until(rows.imu_ns, known_ns[e]), max(rows_until(rows.known_ns, known_ns[e]), 1)
         at = 5 * n + 3 * e
-        R, p, f = I3 if is_new else mat(sums, 3 * e, 0), row(sums, 3 * n + e), row(sums, 4 * n + e)
-        tt, rt, rr = mat(sums, at, 0), mat(sums, at + 3 * n, 0), mat(sums, at + 6 * n, 0)
-        D_t, D_r = mat(sums, at + 9 * n, 0), mat(sums, at + 12 * n, 0)
+        R, p, f = I3 if is_new else mat(sums, (3 * e, 0)), row(sums, 3 * n + e), row(sums, 4 * n + e)
+        tt, rt, rr = mat(sums, (at, 0)), mat(sums, (at + 3 * n, 0)), mat(sums, (at + 6 * n, 0))
+        D_t, D_r = mat(sums, (at + 9 * n, 0)), mat(sums, (at + 12 * n, 0))
         if has_gap(rows.dvl_ns, dvl_rows, k, t, end, longest_ns):
             t, R, p, f = end, np.nan * I3, NOWHERE, NOWHERE
         while t < end:
@@ -125,15 +126,15 @@ def _write_motions(
                 D_t, D_r = D_t - dt * R_k, D_r - dt * (c @ R_k)
                 f += dt * (R_k @ force)
                 p, R = p + s, R @ turn
-        store(R, sums, 3 * e, 0)
+        store(R, sums, (3 * e, 0))
         put(p, sums, 3 * n + e)
         put(f, sums, 4 * n + e)
-        store(tt, sums, at, 0)
-        store(rt, sums, at + 3 * n, 0)
-        store(rr, sums, at + 6 * n, 0)
-        store(D_t, sums, at + 9 * n, 0)
-        store(D_r, sums, at + 12 * n, 0)
+        store(tt, sums, (at, 0))
+        store(rt, sums, (at + 3 * n, 0))
+        store(rr, sums, (at + 6 * n, 0))
+        store(D_t, sums, (at + 9 * n, 0))
+        store(D_r, sums, (at + 12 * n, 0))
         to_j = Mat6(R.T, O3, -1.0 * (R.T @ skew(p)), R.T)  # Ad of the inverse of (R, p)
-        store6(to_j @ Mat6(tt, rt.T, rt, rr) @ to_j.T, C, 6 * e)
-        store(to_j.a @ D_t, D, 6 * e, 0)
-        store(to_j.c @ D_t + to_j.d @ D_r, D, 6 * e + 3, 0)
+        store6(to_j @ Mat6(tt, rt.T, rt, rr) @ to_j.T, C[e])
+        store(to_j.a @ D_t, D[e])
+        store(to_j.c @ D_t + to_j.d @ D_r, D[e], LOWER_LEFT)

@@ -6,6 +6,7 @@ costs as much as a product; outside, the same operators are ordinary methods. Ro
 Fossen, "Handbook of Marine Craft Hydrodynamics and Motion Control", 2011, (2.18), (2.28).
 """
 
+import itertools
 import math
 import operator
 from collections.abc import Callable
@@ -116,6 +117,9 @@ extending.overload_attribute(types.NamedUniTuple, "T", **INLINE)(lambda a: TRANS
 ZERO = Vec3(0.0, 0.0, 0.0)
 O3 = Mat3(ZERO, ZERO, ZERO)
 I3 = Mat3(Vec3(1.0, 0.0, 0.0), Vec3(0.0, 1.0, 0.0), Vec3(0.0, 0.0, 1.0))
+Index = tuple[int | np.integer[Any], ...]
+UPPER_LEFT, UPPER_RIGHT, LOWER_LEFT, LOWER_RIGHT = itertools.product(np.arange(0, 6, 3), repeat=2)
+"""First elements of the blocks of a 6 by 6 array; not literals, for each of which numba would compile anew."""
 
 
 @inlined
@@ -143,8 +147,9 @@ def vec(a: Any) -> Vec3:
 
 
 @inlined
-def mat(A: Floats, r: int = 0, c: int = 0) -> Mat3:
-    """3 × 3 block of an array, its first element at row r and column c."""
+def mat(A: Floats, at: Index = UPPER_LEFT) -> Mat3:
+    """3 × 3 block of an array, its first element at a row and column."""
+    r, c = at
     return Mat3(
         Vec3(A[r, c], A[r, c + 1], A[r, c + 2]),
         Vec3(A[r + 1, c], A[r + 1, c + 1], A[r + 1, c + 2]),
@@ -155,24 +160,25 @@ def mat(A: Floats, r: int = 0, c: int = 0) -> Mat3:
 @inlined
 def mat6(A: Floats) -> Mat6:
     """Matrix from the first six rows and columns of an array."""
-    return Mat6(mat(A, 0, 0), mat(A, 0, 3), mat(A, 3, 0), mat(A, 3, 3))
+    return Mat6(mat(A, UPPER_LEFT), mat(A, UPPER_RIGHT), mat(A, LOWER_LEFT), mat(A, LOWER_RIGHT))
 
 
 @inlined
-def store(A: Mat3, out: Floats, r: int, c: int) -> None:
-    """Write a matrix into an array, its first element at row r and column c."""
+def store(A: Mat3, out: Floats, at: Index = UPPER_LEFT) -> None:
+    """Write a matrix into an array, its first element at a row and column."""
+    r, c = at
     out[r, c], out[r, c + 1], out[r, c + 2] = A.x.x, A.x.y, A.x.z
     out[r + 1, c], out[r + 1, c + 1], out[r + 1, c + 2] = A.y.x, A.y.y, A.y.z
     out[r + 2, c], out[r + 2, c + 1], out[r + 2, c + 2] = A.z.x, A.z.y, A.z.z
 
 
 @inlined
-def store6(A: Mat6, out: Floats, row: int = 0) -> None:
-    """Write a symmetric matrix into the first six columns of an array from a row on, symmetric to the last bit."""
-    store(0.5 * (A.a + A.a.T), out, row, 0)
-    store(A.c.T, out, row, 3)
-    store(A.c, out, row + 3, 0)
-    store(0.5 * (A.d + A.d.T), out, row + 3, 3)
+def store6(A: Mat6, out: Floats) -> None:
+    """Write a symmetric matrix into the first six rows and columns of an array, symmetric to the last bit."""
+    store(0.5 * (A.a + A.a.T), out, UPPER_LEFT)
+    store(A.c.T, out, UPPER_RIGHT)
+    store(A.c, out, LOWER_LEFT)
+    store(0.5 * (A.d + A.d.T), out, LOWER_RIGHT)
 
 
 @inlined

@@ -22,44 +22,21 @@ from sonar_graph.calibration import Calibration, Section
 from sonar_graph.measurements import Depth, Dvl, Floats, Imu, LandmarkDetections, possible_ranges
 from sonar_graph.motion import MotionSource, PreintegratedMotion
 from sonar_graph.navigation.alignment import gravity_direction
-from sonar_graph.numerics import compiled
 from sonar_graph.slam.models import factors
 from sonar_graph.slam.smoother import Changed, Smoother
 from sonar_graph.states import Refusal, RefusedRow
 
 ROUNDING = 1e-13
-"""Share of the largest variance below which what is left of another is taken for zero."""
+"""Share of a determinant below which it is taken for zero."""
 Flags = NDArray[np.bool_]
 
 
 def sound_detections(frame: LandmarkDetections) -> Flags:
     """Rows that a sonar can have measured, shape (n,)."""
-    unsaid = np.asarray(np.isnan(frame.range_azimuth_cov).any(axis=(1, 2)))
-    return possible_ranges(frame.range_m) & (unsaid | positive_definite(frame.range_azimuth_cov))
-
-
-@compiled
-def positive_definite(covs: Floats) -> Flags:
-    """Flags of symmetric matrices, shape (n, k, k), that are finite and positive definite, by Cholesky."""
-    n, k = covs.shape[:2]
-    found = np.ones(n, np.bool_)
-    for row in range(n):
-        L, largest = np.zeros((k, k)), 0.0
-        for i in range(k):
-            largest = max(largest, covs[row, i, i])
-        for i in range(k):
-            for j in range(i + 1):
-                rest = covs[row, i, j]
-                for m in range(j):
-                    rest -= L[i, m] * L[j, m]
-                if i > j:
-                    L[i, j] = rest / L[j, j]
-                elif rest > ROUNDING * largest and rest < np.inf:
-                    L[i, i] = np.sqrt(rest)
-                else:  # NaN ends here too
-                    found[row] = False
-                    L[i, i] = 1.0
-    return found
+    a, b, c, d = frame.range_azimuth_cov.reshape(-1, 4).T
+    with np.errstate(all="ignore"):
+        is_definite = (a > 0) & (a * d - b * c > ROUNDING * a * d)
+    return possible_ranges(frame.range_m) & (is_definite | np.isnan(frame.range_azimuth_cov).any(axis=(1, 2)))
 
 
 S_PER_NS = 1e-9

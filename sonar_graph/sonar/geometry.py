@@ -23,7 +23,6 @@ from sonar_graph.devices import DIDSON_BEAMS, aris_azimuths, didson_azimuths
 from sonar_graph.errors import CalibrationError
 from sonar_graph.images import SonarFrames
 from sonar_graph.measurements import Floats
-from sonar_graph.numerics import compiled
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +68,8 @@ class FloorView:
 
     def floor_points(self, ranges_m: Floats, azimuths_rad: Floats) -> Floats:
         """Points in the sonar frame where rays meet the floor, shape (n, 3); NaN where they do not."""
-        elevations = floor_elevations(ranges_m, azimuths_rad, self.level_R_sonar[2], self.height_m)
+        cos_e, sin_e = floor_lift(ranges_m, azimuths_rad, self.level_R_sonar[2], self.height_m)
+        elevations = np.arctan2(sin_e, cos_e)
         return points(ranges_m, azimuths_rad, elevations)
 
     def floor_point(self, range_m: float, azimuth_rad: float) -> Floats | None:
@@ -200,27 +200,14 @@ def _elevation_derivatives(points_m: Floats) -> Floats:
     return np.stack([-lift * points_m[:, 0], -lift * points_m[:, 1], level], axis=1)
 
 
-@compiled
-def floor_lift(range_m: float, cos_a: float, sin_a: float, up: Floats, height_m: float) -> tuple[float, float]:
-    """Cosine and sine of the elevation at which a ray of this range meets the floor; NaN where it does not.
+def floor_lift(ranges_m: Floats, azimuths_rad: Floats, up: Floats, height_m: float) -> tuple[Floats, Floats]:
+    """Cosine and sine of the elevation at which rays meet the floor, shape (n,); NaN where they do not.
 
     With ``A = u1 cos a + u2 sin a``, ``B = u3``, ``k = -h / r``, ``w = sqrt(A^2 + B^2 - k^2)``, the solutions are
     ``cos e = (A k +- B w) / (A^2 + B^2)``, ``sin e = (B k -+ A w) / (A^2 + B^2)``; the larger cosine is nearer to the
     centre beam.
     """
-    across, lift, k = up[0] * cos_a + up[1] * sin_a, up[2], -height_m / range_m
+    across, lift, k = up[0] * np.cos(azimuths_rad) + up[1] * np.sin(azimuths_rad), up[2], -height_m / ranges_m
     norm2 = across * across + lift * lift
-    if not k * k <= norm2:
-        return math.nan, math.nan
-    w = math.copysign(math.sqrt(norm2 - k * k), lift)
+    w = np.copysign(np.sqrt(np.where(k * k <= norm2, norm2 - k * k, np.nan)), lift)
     return (across * k + lift * w) / norm2, (lift * k - across * w) / norm2
-
-
-@compiled
-def floor_elevations(ranges_m: Floats, azimuths_rad: Floats, up: Floats, height_m: float) -> Floats:
-    """Elevation at which each of n rays meets the floor, shape (n,); NaN where it does not."""
-    found = np.empty(len(ranges_m))
-    for i in range(len(found)):
-        cos_e, sin_e = floor_lift(ranges_m[i], math.cos(azimuths_rad[i]), math.sin(azimuths_rad[i]), up, height_m)
-        found[i] = math.atan2(sin_e, cos_e)
-    return found

@@ -9,7 +9,6 @@ of about one independent level a node. Regions have centroids and second moments
 floor where it is known, else in the slant plane. Derivation: docs/theory/candidates.md.
 """
 
-import math
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -18,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonar_graph.measurements import Floats, Ints
-from sonar_graph.numerics import compiled
 from sonar_graph.sonar.geometry import FloorView, floor_lift, ranges_azimuths_elevations
 
 Floats32 = NDArray[np.float32]
@@ -106,30 +104,24 @@ def measure_regions(
     return Regions(points, r, a, e, sums[:, AREA], np.sqrt(12 * np.maximum(largest, 0)), level)
 
 
-@compiled
-def floor_cell(
-    r: float, cos_a: float, sin_a: float, level_R_sonar: Floats, height_m: float
-) -> tuple[float, float, float]:
-    """Level x and y of a floor point, and area per unit of range and azimuth there; area 0 off the floor.
+def floor_cells(
+    r: Floats, azimuths_rad: Floats, level_R_sonar: Floats, height_m: float
+) -> tuple[Floats, Floats, Floats]:
+    """Level x and y of floor points, and area per unit of range and azimuth there; NaN off the floor.
 
     Steps in range and in azimuth, at constant height below the sonar, are perpendicular:
     ``dg = (r / sqrt(r^2 - h^2)) dr`` and ``|dq/da + dq/de de/da| da`` with ``de/da = -(u . dq/da) / (u . dq/de)``.
     """
-    up = level_R_sonar[2]
-    cos_e, sin_e = floor_lift(r, cos_a, sin_a, up, height_m)
-    g2 = r * r - height_m * height_m
-    if not g2 > 0 or not math.isfinite(cos_e):
-        return 0.0, 0.0, 0.0
-    qx, qy, qz = r * cos_e * cos_a, r * cos_e * sin_a, r * sin_e
-    by_elevation = r * (up[2] * cos_e - sin_e * (up[0] * cos_a + up[1] * sin_a))
-    ratio = (up[1] * qx - up[0] * qy) / by_elevation
-    step = r * math.sqrt(cos_e * cos_e + ratio * ratio)
-    x = level_R_sonar[0, 0] * qx + level_R_sonar[0, 1] * qy + level_R_sonar[0, 2] * qz
-    y = level_R_sonar[1, 0] * qx + level_R_sonar[1, 1] * qy + level_R_sonar[1, 2] * qz
-    return x, y, step * r / math.sqrt(g2)
+    up, cos_a, sin_a = level_R_sonar[2], np.cos(azimuths_rad), np.sin(azimuths_rad)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cos_e, sin_e = floor_lift(r, azimuths_rad, up, height_m)
+        q = r * np.stack([cos_e * cos_a, cos_e * sin_a, sin_e])
+        by_elevation = r * (up[2] * cos_e - sin_e * (up[0] * cos_a + up[1] * sin_a))
+        step = r * np.hypot(cos_e, (up[1] * q[0] - up[0] * q[1]) / by_elevation)
+        x, y, _ = level_R_sonar @ q
+        return x, y, step * r / np.sqrt(r * r - height_m * height_m)
 
 
-@compiled
 def pixel_sums(
     contrast_db: Floats32,
     labels: NDArray[np.int32],
@@ -140,31 +132,28 @@ def pixel_sums(
     height_m: float,
 ) -> Floats:
     """Sums over the pixels of each region, shape (count, 8)."""
-    sums = np.zeros((count, 8))
-    beams, bins = labels.shape
-    dr = abs(ranges_m[bins - 1] - ranges_m[0]) / (bins - 1)
-    da = abs(azimuths_rad[beams - 1] - azimuths_rad[0]) / (beams - 1)
-    for beam in range(beams):
-        cos_a, sin_a = math.cos(azimuths_rad[beam]), math.sin(azimuths_rad[beam])
-        for bin_ in range(bins):
-            row = labels[beam, bin_] - 1
-            if row < 0:
-                continue
-            r = ranges_m[bin_]
-            if height_m > 0:
-                x, y, area = floor_cell(r, cos_a, sin_a, level_R_sonar, height_m)
-                area *= dr * da
-            else:
-                x, y, area = r * cos_a, r * sin_a, r * dr * da
-            sums[row, PIXELS] += 1.0
-            sums[row, LEVEL] += contrast_db[beam, bin_]
-            if area > 0:
-                sums[row, AREA] += area
-                sums[row, X] += area * x
-                sums[row, Y] += area * y
-                sums[row, XX] += area * x * x
-                sums[row, XY] += area * x * y
-                sums[row, YY] += area * y * y
+    at = np.flatnonzero(labels)
+    region, r = labels.ravel()[at] - 1, ranges_m[at % len(ranges_m)]
+    azimuths = azimuths_rad[at // len(ranges_m)]
+    if height_m > 0:
+        x, y, area = floor_cells(r, azimuths, level_R_sonar, height_m)
+        x, y, area = (np.where(area > 0, part, 0.0) for part in (x, y, area))
+    else:
+        x, y, area = r * np.cos(azimuths), r * np.sin(azimuths), r
+    dr = abs(ranges_m[-1] - ranges_m[0]) / (len(ranges_m) - 1)
+    area = area * dr * abs(azimuths_rad[-1] - azimuths_rad[0]) / (len(azimuths_rad) - 1)
+    sums = np.empty((count, 8))
+    for column, weights in (
+        (AREA, area),
+        (LEVEL, contrast_db.ravel()[at]),
+        (X, area * x),
+        (Y, area * y),
+        (XX, area * x * x),
+        (XY, area * x * y),
+        (YY, area * y * y),
+        (PIXELS, None),
+    ):
+        sums[:, column] = np.bincount(region, weights, count)
     return sums
 
 

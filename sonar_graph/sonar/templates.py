@@ -136,20 +136,21 @@ class PolarGrid(NamedTuple):
 
     def patch(self, image_db: Floats32, view: FloorView, centre_m: Floats, side: int, cell_m: float) -> Patch:
         """The image on a grid of ``side`` by ``side`` floor points around a centre."""
-        level, seen = sample_floor(self, image_db, view.level_R_sonar, view.height_m, centre_m, side, cell_m)
+        level, seen = np.zeros((2, side, side), np.float32)
+        sample_floor(self, image_db, view.level_R_sonar, view.height_m, centre_m, cell_m, level, seen)
         return Patch(level, seen, centre_m)
 
 
 @compiled
 def sample_floor(
-    grid: PolarGrid, image_db: Floats32, R: Floats, height_m: float, centre: Floats, side: int, cell_m: float
-) -> tuple[Floats32, Floats32]:
-    """Levels on a square grid of the floor, and whether each point is in the image, shapes (side, side).
+    grid: PolarGrid, image_db: Floats32, R: Floats, height_m: float, centre: Floats, cell_m: float,
+    level: Floats32, seen: Floats32,
+) -> None:  # fmt: skip
+    """Fill in levels on a square grid of the floor, and 1 where a point is in the image, shapes (side, side).
 
     Each is the mean of decibels over the range that a cell covers, linear between beams. R is ``level_R_sonar``.
     """
-    beams, bins = image_db.shape
-    level, seen = np.zeros((side, side), np.float32), np.zeros((side, side), np.float32)
+    (beams, bins), side = image_db.shape, len(level)
     half_bins = 0.5 * cell_m / grid.bin_m
     half = 0.5 * (side - 1)
     for i in range(side):
@@ -177,4 +178,3 @@ def sample_floor(
                 total += (1 - share) * image_db[b, n] + share * image_db[b + 1, n]
             level[i, j] = total / (last - first + 1)
             seen[i, j] = 1.0
-    return level, seen

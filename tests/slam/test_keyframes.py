@@ -1,7 +1,6 @@
 """Keyframes and the factors that they get from odometry, depth and gravity, on drives made by hand."""
 
 from dataclasses import replace
-from itertools import product
 
 import gtsam
 import numpy as np
@@ -21,12 +20,12 @@ from sonar_graph.calibration import (
     SonarCalibration,
     Start,
 )
-from sonar_graph.measurements import Depth, Dvl, Imu
+from sonar_graph.measurements import Depth, Dvl, Imu, LandmarkDetections
 from sonar_graph.navigation import Odometry, PreintegratedMotion
 from sonar_graph.navigation.alignment.gravity import earth_rate_in_world
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 from sonar_graph.slam import Isam2
-from sonar_graph.slam.keyframes import KeyframeParams, Keyframes, positive_definite, weights_at_end
+from sonar_graph.slam.keyframes import KeyframeParams, Keyframes, sound_detections, weights_at_end
 from tests.navigation.rows import NS, T0_NS, dvl, imu, stamps
 
 from .graphs import factors_of
@@ -417,19 +416,25 @@ def test_depths_too_long_before_the_end_of_a_gap_leave_the_factor_of_the_others(
     assert factor.noiseModel().sigmas() == pytest.approx(alone.noiseModel().sigmas())
 
 
-@pytest.mark.parametrize("k", [2, 3])
-def test_positive_definite_are_those_whose_eigenvalues_are_above_zero(k):
-    rng = np.random.default_rng(k)
-    roots = rng.normal(size=(2000, k, k))
-    matrices = roots @ roots.transpose(0, 2, 1) - rng.uniform(0, 1, 2000)[:, None, None] * np.eye(k)
-    matrices *= 10.0 ** rng.uniform(-8, 8, 2000)[:, None, None]
-    expected = np.linalg.eigvalsh(matrices)[:, 0] > 0
+def test_sound_detections_have_covariances_whose_eigenvalues_are_above_zero():
+    rng = np.random.default_rng(2)
+    roots = rng.normal(size=(2000, 2, 2))
+    covs = roots @ roots.transpose(0, 2, 1) - rng.uniform(0, 1, 2000)[:, None, None] * np.eye(2)
+    covs *= 10.0 ** rng.uniform(-8, 8, 2000)[:, None, None]
+    unusable = [
+        np.diag([np.inf, 1.0]),
+        np.diag([1.0, -np.inf]),
+        [[1.0, np.inf], [np.inf, 1.0]],
+        [[0.0, 0.0], [0.0, 1.0]],
+    ]
+    covs = np.concatenate([covs, unusable, np.full((1, 2, 2), np.nan)])
+    n = len(covs)
+    frame = LandmarkDetections(
+        np.zeros(n, np.int64), np.ones(n), np.zeros(n), covs, np.zeros((n, 1), np.int64), np.ones((n, 1))
+    )
+    expected = np.linalg.eigvalsh(covs[:2000])[:, 0] > 0
     assert 200 < expected.sum() < 1800
-    assert np.array_equal(positive_definite(matrices), expected)
-    for i, j, wrong in product(range(k), range(k), [np.nan, np.inf, -np.inf]):
-        matrix = np.eye(k)
-        matrix[i, j] = matrix[j, i] = wrong
-        assert positive_definite(np.stack([np.eye(k), matrix])).tolist() == [True, False]
+    assert np.array_equal(sound_detections(frame), [*expected, *[False] * len(unusable), True])
 
 
 @given(st.lists(st.tuples(st.floats(1e-9, 1e-2), st.floats(1e-5, 1e-2)), min_size=1, max_size=12))

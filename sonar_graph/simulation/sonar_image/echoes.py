@@ -105,11 +105,13 @@ def block_rays(view: SonarPlacement, surface: Surface, horizon: Horizon, raised_
             distance = int(run / horizon.distance_m)
             if ahead > 0 and 0 <= bearing < bearings and distance < distances:
                 rise = (view.floor_z_m + relief - view.position_m[2]) / run
-                horizon.tangent[bearing, distance] = max(horizon.tangent[bearing, distance], rise)
+                if rise > horizon.tangent[bearing, distance]:
+                    horizon.tangent[bearing, distance] = rise
     for bearing in range(bearings):
         for distance in range(1, distances):
             before = horizon.tangent[bearing, distance - 1]
-            horizon.tangent[bearing, distance] = max(horizon.tangent[bearing, distance], before)
+            if before > horizon.tangent[bearing, distance]:
+                horizon.tangent[bearing, distance] = before
 
 
 @compiled

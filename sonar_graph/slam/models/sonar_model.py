@@ -43,14 +43,12 @@ def project(q: Floats) -> tuple[Floats, Floats]:
     return np.array([range_m, math.atan2(q[1], q[0])]), D_q
 
 
-@compiled
 def sonar_point(range_m: float, azimuth_rad: float, elevation_rad: float) -> Floats:
     """The point in the sonar frame with these spherical coordinates, shape (3,), m."""
     level = range_m * math.cos(elevation_rad)
     return np.array([level * math.cos(azimuth_rad), level * math.sin(azimuth_rad), range_m * math.sin(elevation_rad)])
 
 
-@compiled
 def sonar_point_jacobian(range_m: float, azimuth_rad: float, elevation_rad: float) -> Floats:
     """Derivative of `sonar_point` by (range, azimuth, elevation), shape (3, 3)."""
     ca, sa, ce, se = math.cos(azimuth_rad), math.sin(azimuth_rad), math.cos(elevation_rad), math.sin(elevation_rad)

@@ -28,7 +28,7 @@ def project_all(points: Floats, world_T_sonar: Floats) -> tuple[Floats, Floats, 
     ``D_q [[q]x | -I]``, shape (m, 2, 6), and by the point, ``D_q sonar_R_world``, shape (m, 2, 3).
     """
     T, m = world_T_sonar, len(points)
-    view, by_sonar, by_point = np.empty((m, 2)), np.zeros((m, 2, 6)), np.empty((m, 2, 3))
+    view, by_sonar, by_point = np.empty((m, 2)), np.empty((m, 2, 6)), np.empty((m, 2, 3))
     for k in range(m):
         dx, dy, dz = points[k, 0] - T[0, 3], points[k, 1] - T[1, 3], points[k, 2] - T[2, 3]
         x = T[0, 0] * dx + T[1, 0] * dy + T[2, 0] * dz
@@ -37,9 +37,10 @@ def project_all(points: Floats, world_T_sonar: Floats) -> tuple[Floats, Floats, 
         h2 = x * x + y * y
         r = math.sqrt(h2 + z * z)
         view[k, 0], view[k, 1] = r, math.atan2(y, x)
-        by_sonar[k, 0, 3], by_sonar[k, 0, 4], by_sonar[k, 0, 5] = -x / r, -y / r, -z / r  # q^T [q]x = 0
+        by_sonar[k, 0, 0], by_sonar[k, 0, 1], by_sonar[k, 0, 2] = 0.0, 0.0, 0.0  # q^T [q]x
+        by_sonar[k, 0, 3], by_sonar[k, 0, 4], by_sonar[k, 0, 5] = -x / r, -y / r, -z / r
         by_sonar[k, 1, 0], by_sonar[k, 1, 1], by_sonar[k, 1, 2] = x * z / h2, y * z / h2, -1.0
-        by_sonar[k, 1, 3], by_sonar[k, 1, 4] = y / h2, -x / h2
+        by_sonar[k, 1, 3], by_sonar[k, 1, 4], by_sonar[k, 1, 5] = y / h2, -x / h2, 0.0
         for i in range(2):
             for j in range(3):
                 by_point[k, i, j] = -(
