@@ -463,7 +463,7 @@ class FilterShell(ABC):
         start_ns = self.odometry.start_by(end_ns)
         if start_ns is None:
             return
-        self._reached_ns = int(self.odometry.reached_ns(np.array([start_ns]))[0])
+        self._reached_ns = self.odometry.reached_ns(start_ns)
         self.node_ns = self._opened_ns = self._kept_ns = start_ns
         self._opened_velocity = self.odometry.velocity_at_imu(start_ns)
 
@@ -515,15 +515,14 @@ class FilterShell(ABC):
     def _events(self, measurements: Measurements, since_ns: int, views: Views) -> Events:
         """What happens up to the end of a call, from the state's epoch on."""
         end_ns, depth = measurements.end_ns, measurements.depth
-        epochs_ns = self.odometry.epochs(self.node_ns, end_ns)
+        epochs_ns, reached_ns = self.odometry.epochs_reached(self.node_ns, end_ns)
         depth_ns, z_m, variance_m2 = NO_STAMPS, NO_DEPTH, NO_DEPTH
         if depth is not None:
             depth_ns, z_m, variance_m2 = depth.stamps_ns, depth.z_m, depth.variance_m2
         columns = np.empty((5, 3 * len(epochs_ns) + len(depth_ns) + len(views.stamp_ns) + 1), np.int64)
-        reached_ns, is_planar = self.odometry.reached_ns(epochs_ns), self._plane is not None
         n = in_order(
             epochs_ns, reached_ns, depth_ns, views.stamp_ns, views.outcome, since_ns, end_ns,
-            self.node_ns, self._opened_ns, self._interval_ns, is_planar, columns,
+            self.node_ns, self._opened_ns, self._interval_ns, self._plane is not None, columns,
         )  # fmt: skip
         stamp_ns, start_ns, until_ns, kind, row = columns[:, :n]
         motions = self.odometry.motions(start_ns, until_ns, stamp_ns, NO_BIAS)

@@ -117,8 +117,11 @@ class MotionSource(Protocol):
     def epochs(self, after_ns: int, until_ns: int) -> Ints:
         """Epochs after one instant that are reached at another, in order, shape (n,)."""
 
-    def reached_ns(self, epochs_ns: Ints) -> Ints:
-        """Instants at which epochs are reached: an IMU row covers them, and their velocities are known; shape (n,)."""
+    def epochs_reached(self, after_ns: int, until_ns: int) -> tuple[Ints, Ints]:
+        """`epochs` and their `reached_ns`, shapes (n,)."""
+
+    def reached_ns(self, epoch_ns: int) -> int:
+        """Instant at which an epoch is reached: an IMU row covers it, and its velocity is known."""
 
     def is_gap(self, start_ns: int, end_ns: int) -> bool:
         """True for a time without Doppler rows that is too long for a linear velocity."""

@@ -187,8 +187,8 @@ class _Feed:
         ]
 
     def advance(self, until_ns: int) -> None:
-        epochs_ns = self.odometry.epochs(self.node_ns, until_ns)
-        for node_ns, reached_ns in zip(epochs_ns.tolist(), self.odometry.reached_ns(epochs_ns).tolist(), strict=True):
+        epochs_ns, reached = self.odometry.epochs_reached(self.node_ns, until_ns)
+        for node_ns, reached_ns in zip(epochs_ns.tolist(), reached.tolist(), strict=True):
             stamps_ns = np.array([self.node_ns, node_ns])
             if not self.predicts_by_node:
                 imu_ns = self.sequence.imu.stamps_ns

@@ -125,17 +125,22 @@ class Odometry:
         first = dvl_ns[np.searchsorted(dvl_ns, imu_ns[0]) :] if len(imu_ns) else dvl_ns[:0]
         if not len(first) or first[0] > imu_ns[-1]:
             return None
-        return int(first[0]) if self.reached_ns(first[:1])[0] <= until_ns else None
+        return int(first[0]) if self.reached_ns(int(first[0])) <= until_ns else None
 
     def epochs(self, after_ns: int, until_ns: int) -> Ints:
         """Epochs after one instant that are reached at another, in order, shape (n,)."""
-        dvl_ns = self._dvl.stamps_ns
-        first, last = _epochs_between(after_ns, until_ns, self._imu.stamps_ns, dvl_ns, self._dvl.values[2])
-        return dvl_ns[first:last]
+        return self.epochs_reached(after_ns, until_ns)[0]
 
-    def reached_ns(self, epochs_ns: Ints) -> Ints:
-        """Instants at which epochs are reached: an IMU row covers them, and their velocities are known; shape (n,)."""
-        return _reached(epochs_ns, self._imu.stamps_ns, self._dvl.stamps_ns, self._dvl.values[2])
+    def epochs_reached(self, after_ns: int, until_ns: int) -> tuple[Ints, Ints]:
+        """`epochs` and their `reached_ns`, shapes (n,)."""
+        dvl_ns, known_ns = self._dvl.stamps_ns, self._dvl.values[2]
+        first, last, reached_ns = _epochs_reached(after_ns, until_ns, self._imu.stamps_ns, dvl_ns, known_ns)
+        return dvl_ns[first:last], reached_ns
+
+    def reached_ns(self, epoch_ns: int) -> int:
+        """Instant at which an epoch is reached: an IMU row covers it, and its velocity is known."""
+        imu_ns, dvl_ns, known_ns = self._imu.stamps_ns, self._dvl.stamps_ns, self._dvl.values[2]
+        return int(max(imu_ns[imu_ns.searchsorted(epoch_ns)], known_ns[dvl_ns.searchsorted(epoch_ns)]))
 
     def is_gap(self, start_ns: int, end_ns: int) -> bool:
         """True for a time without Doppler rows that is too long for a linear velocity."""
@@ -247,22 +252,15 @@ def _joined(before: PreintegratedMotion | None, motion: PreintegratedMotion) -> 
 
 
 @compiled
-def _epochs_between(after_ns: int, until_ns: int, imu_ns: Ints, dvl_ns: Ints, known_ns: Ints) -> tuple[int, int]:
-    """First and last row (exclusive) of `Odometry.epochs`."""
-    seen = rows_until(imu_ns, until_ns)
-    if seen == 0:
-        return 0, 0
-    return rows_until(dvl_ns, after_ns), min(rows_until(known_ns, until_ns), rows_until(dvl_ns, imu_ns[seen - 1]))
-
-
-@compiled
-def _reached(epochs_ns: Ints, imu_ns: Ints, dvl_ns: Ints, known_ns: Ints) -> Ints:
-    """As `Odometry.reached_ns`."""
-    reached_ns = np.empty(len(epochs_ns), np.int64)
-    for k in range(len(epochs_ns)):
-        before_ns = epochs_ns[k] - 1
-        reached_ns[k] = max(imu_ns[rows_until(imu_ns, before_ns)], known_ns[rows_until(dvl_ns, before_ns)])
-    return reached_ns
+def _epochs_reached(after_ns: int, until_ns: int, imu_ns: Ints, dvl_ns: Ints, known_ns: Ints) -> tuple[int, int, Ints]:
+    """First and last row (exclusive) of `Odometry.epochs`, and when these are reached."""
+    seen, first, last = rows_until(imu_ns, until_ns), rows_until(dvl_ns, after_ns), 0
+    if seen > 0:
+        last = min(rows_until(known_ns, until_ns), rows_until(dvl_ns, imu_ns[seen - 1]))
+    reached_ns = np.empty(max(last - first, 0), np.int64)
+    for k in range(len(reached_ns)):
+        reached_ns[k] = max(imu_ns[rows_until(imu_ns, dvl_ns[first + k] - 1)], known_ns[first + k])
+    return first, last, reached_ns
 
 
 def _in_frame(motion: PreintegratedMotion | None, earth: Floats) -> Floats:

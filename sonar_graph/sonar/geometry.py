@@ -68,7 +68,9 @@ class FloorView:
 
     def floor_points(self, ranges_m: Floats, azimuths_rad: Floats) -> Floats:
         """Points in the sonar frame where rays meet the floor, shape (n, 3); NaN where they do not."""
-        cos_e, sin_e = floor_lift(ranges_m, azimuths_rad, self.level_R_sonar[2], self.height_m)
+        cos_e, sin_e = floor_lift(
+            ranges_m, np.cos(azimuths_rad), np.sin(azimuths_rad), self.level_R_sonar[2], self.height_m
+        )
         elevations = np.arctan2(sin_e, cos_e)
         return points(ranges_m, azimuths_rad, elevations)
 
@@ -200,14 +202,15 @@ def _elevation_derivatives(points_m: Floats) -> Floats:
     return np.stack([-lift * points_m[:, 0], -lift * points_m[:, 1], level], axis=1)
 
 
-def floor_lift(ranges_m: Floats, azimuths_rad: Floats, up: Floats, height_m: float) -> tuple[Floats, Floats]:
+def floor_lift(ranges_m: Floats, cos_a: Floats, sin_a: Floats, up: Floats, height_m: float) -> tuple[Floats, Floats]:
     """Cosine and sine of the elevation at which rays meet the floor, shape (n,); NaN where they do not.
 
     With ``A = u1 cos a + u2 sin a``, ``B = u3``, ``k = -h / r``, ``w = sqrt(A^2 + B^2 - k^2)``, the solutions are
     ``cos e = (A k +- B w) / (A^2 + B^2)``, ``sin e = (B k -+ A w) / (A^2 + B^2)``; the larger cosine is nearer to the
     centre beam.
     """
-    across, lift, k = up[0] * np.cos(azimuths_rad) + up[1] * np.sin(azimuths_rad), up[2], -height_m / ranges_m
+    across, lift, k = up[0] * cos_a + up[1] * sin_a, up[2], -height_m / ranges_m
     norm2 = across * across + lift * lift
-    w = np.copysign(np.sqrt(np.where(k * k <= norm2, norm2 - k * k, np.nan)), lift)
+    with np.errstate(invalid="ignore"):
+        w = math.copysign(1.0, lift) * np.sqrt(norm2 - k * k)
     return (across * k + lift * w) / norm2, (lift * k - across * w) / norm2

@@ -105,21 +105,21 @@ def measure_regions(
 
 
 def floor_cells(
-    r: Floats, azimuths_rad: Floats, level_R_sonar: Floats, height_m: float
+    r: Floats, cos_a: Floats, sin_a: Floats, level_R_sonar: Floats, height_m: float
 ) -> tuple[Floats, Floats, Floats]:
-    """Level x and y of floor points, and area per unit of range and azimuth there; NaN off the floor.
+    """Level x and y of floor points, and area per unit of range and azimuth there; 0 off the floor.
 
     Steps in range and in azimuth, at constant height below the sonar, are perpendicular:
     ``dg = (r / sqrt(r^2 - h^2)) dr`` and ``|dq/da + dq/de de/da| da`` with ``de/da = -(u . dq/da) / (u . dq/de)``.
     """
-    up, cos_a, sin_a = level_R_sonar[2], np.cos(azimuths_rad), np.sin(azimuths_rad)
+    up = level_R_sonar[2]
+    cos_e, sin_e = floor_lift(r, cos_a, sin_a, up, height_m)
     with np.errstate(divide="ignore", invalid="ignore"):
-        cos_e, sin_e = floor_lift(r, azimuths_rad, up, height_m)
-        q = r * np.stack([cos_e * cos_a, cos_e * sin_a, sin_e])
-        by_elevation = r * (up[2] * cos_e - sin_e * (up[0] * cos_a + up[1] * sin_a))
-        step = r * np.hypot(cos_e, (up[1] * q[0] - up[0] * q[1]) / by_elevation)
-        x, y, _ = level_R_sonar @ q
-        return x, y, step * r / np.sqrt(r * r - height_m * height_m)
+        ratio = (up[1] * cos_a - up[0] * sin_a) * cos_e / (up[2] * cos_e - sin_e * (up[0] * cos_a + up[1] * sin_a))
+        area = r * r * np.sqrt((cos_e * cos_e + ratio * ratio) / (r * r - height_m * height_m))
+    x, y, _ = level_R_sonar @ np.stack([cos_e * cos_a, cos_e * sin_a, sin_e])
+    is_met = area > 0
+    return np.where(is_met, r * x, 0.0), np.where(is_met, r * y, 0.0), np.where(is_met, area, 0.0)
 
 
 def pixel_sums(
@@ -132,29 +132,15 @@ def pixel_sums(
     height_m: float,
 ) -> Floats:
     """Sums over the pixels of each region, shape (count, 8)."""
-    at = np.flatnonzero(labels)
-    region, r = labels.ravel()[at] - 1, ranges_m[at % len(ranges_m)]
-    azimuths = azimuths_rad[at // len(ranges_m)]
-    if height_m > 0:
-        x, y, area = floor_cells(r, azimuths, level_R_sonar, height_m)
-        x, y, area = (np.where(area > 0, part, 0.0) for part in (x, y, area))
-    else:
-        x, y, area = r * np.cos(azimuths), r * np.sin(azimuths), r
-    dr = abs(ranges_m[-1] - ranges_m[0]) / (len(ranges_m) - 1)
-    area = area * dr * abs(azimuths_rad[-1] - azimuths_rad[0]) / (len(azimuths_rad) - 1)
-    sums = np.empty((count, 8))
-    for column, weights in (
-        (AREA, area),
-        (LEVEL, contrast_db.ravel()[at]),
-        (X, area * x),
-        (Y, area * y),
-        (XX, area * x * x),
-        (XY, area * x * y),
-        (YY, area * y * y),
-        (PIXELS, None),
-    ):
-        sums[:, column] = np.bincount(region, weights, count)
-    return sums
+    at = np.flatnonzero(labels != 0)  # a comparison first: six times as fast
+    beam, bin_ = np.divmod(at, len(ranges_m))
+    region, r = labels.ravel()[at] - 1, ranges_m[bin_]
+    cos_a, sin_a = np.cos(azimuths_rad)[beam], np.sin(azimuths_rad)[beam]
+    x, y, area = floor_cells(r, cos_a, sin_a, level_R_sonar, height_m) if height_m > 0 else (r * cos_a, r * sin_a, r)
+    dr, da = (abs(places[-1] - places[0]) / (len(places) - 1) for places in (ranges_m, azimuths_rad))
+    area, level = area * (dr * da), contrast_db.ravel()[at]
+    moments = area, level, (ax := area * x), (ay := area * y), ax * x, ax * y, ay * y, None
+    return np.stack([np.bincount(region, weights, count) for weights in moments], axis=1)
 
 
 class CandidateVerdict(IntEnum):

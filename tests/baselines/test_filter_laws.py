@@ -381,9 +381,9 @@ def test_a_bias_and_the_earth_s_rate_are_removed_from_a_motion_as_from_its_rows(
     for rows in (mission.imu, unbiased):
         odometry = Odometry(mission.calibration)
         odometry.add(rows, mission.dvl)
-        epochs_ns = odometry.epochs(mission.start_ns, mission.start_ns + 20 * NS_PER_S)
+        epochs_ns, reached_ns = odometry.epochs_reached(mission.start_ns, mission.start_ns + 20 * NS_PER_S)
         start_ns, end_ns = epochs_ns[:-8], epochs_ns[8:]
-        motions.append(odometry.motions(start_ns, end_ns, odometry.reached_ns(end_ns), zero))
+        motions.append(odometry.motions(start_ns, end_ns, reached_ns[8:], zero))
     turns = 0.0
     for start, end, (dR, dp, _, D, impulse), exact in zip(
         start_ns, end_ns, zip(*motions[0], strict=True), zip(*motions[1], strict=True), strict=True

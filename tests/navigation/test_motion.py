@@ -59,7 +59,7 @@ def test_motions_are_dead_reckoning_and_a_dense_recursion_over_steps_cut_by_hand
     odometry.add(inertial, log)
     first_ns = int(log.stamps_ns[0])
     start, end, known = (max(T0_NS + ms * 1_000_000, first_ns) for ms in ends_ms)
-    known = max(known, int(odometry.reached_ns(log.stamps_ns[:1])[0]))
+    known = max(known, odometry.reached_ns(first_ns))
     intervals = np.array([(first_ns, int(log.stamps_ns[-1]), int(inertial.stamps_ns[-1])), (start, end, known)])
     found = odometry.motions(*intervals.T.copy(), BIAS)
     for e, (begin_ns, end_ns, known_ns) in enumerate(intervals.tolist()):

@@ -301,8 +301,8 @@ def answers(odometry: Odometry, until_ns: int, asked_ns: int) -> list[np.ndarray
     """What is told at an instant: epochs, and motions from the first and others, to epochs and another instant."""
     if (first_ns := odometry.start_by(until_ns)) is None:
         return []
-    epochs_ns = odometry.epochs(first_ns - 1, until_ns)
-    reached_ns, newest_ns, middle_ns = odometry.reached_ns(epochs_ns), epochs_ns[-1], epochs_ns[len(epochs_ns) // 2]
+    epochs_ns, reached_ns = odometry.epochs_reached(first_ns - 1, until_ns)
+    newest_ns, middle_ns = epochs_ns[-1], epochs_ns[len(epochs_ns) // 2]
     asked_ns = min(max(asked_ns, reached_ns[0]), until_ns)
     starts_ns = first_ns, middle_ns, (newest_ns + until_ns) // 2
     found = [odometry.motion(first_ns, asked_ns, BIAS, np.eye(3), asked_ns)]
@@ -355,7 +355,7 @@ def test_a_row_that_is_completed_later_is_not_known_before():
     assert same(found[0], found[1])
     assert not found[1].i_T_j.equals(found[2].i_T_j, 1e-6)
     assert same(found[2], found[3])
-    assert odometry.reached_ns(np.array([at(4.403)])) == at(6.603)
+    assert odometry.reached_ns(at(4.403)) == at(6.603)
     assert at(4.403) not in odometry.epochs(0, at(6.602))
     assert at(4.403) in odometry.epochs(0, at(6.603))
     one, first, second = (

@@ -285,12 +285,12 @@ def test_a_row_that_comes_after_later_ones_is_an_epoch_from_the_instant_on_at_wh
     odometry = Odometry(Calibration())
     odometry.add(inertial, rows.rows(np.arange(len(rows)) != missing))
     odometry.add(None, rows.rows(slice(missing, missing + 1)))
-    epochs_ns = odometry.epochs(0, T0_NS + 10 * NS)
+    epochs_ns, reached_ns = odometry.epochs_reached(0, T0_NS + 10 * NS)
     assert np.array_equal(epochs_ns, rows.stamps_ns)
-    for until_ns in np.unique(odometry.reached_ns(epochs_ns)).tolist():
+    assert reached_ns.tolist() == [odometry.reached_ns(epoch_ns) for epoch_ns in epochs_ns.tolist()]
+    for until_ns in np.unique(reached_ns).tolist():
         for instant_ns in (until_ns - 1, until_ns):
-            reached = odometry.reached_ns(epochs_ns) <= instant_ns
-            assert np.array_equal(odometry.epochs(0, instant_ns), epochs_ns[reached])
+            assert np.array_equal(odometry.epochs(0, instant_ns), epochs_ns[reached_ns <= instant_ns])
 
 
 @pytest.mark.parametrize(("ratio", "is_sound"), [(1e-11, True), (1e-12, True), (0.0, False), (-1e-12, False)])
