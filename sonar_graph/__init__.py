@@ -4,7 +4,7 @@ From a log to a report::
 
     import sonar_graph as sg
 
-    sequence = sg.read_log("dive.mcap")  # IMU, DVL, depth, detections, truth where there is one
+    sequence = sg.read_log("dive.mcap")  # IMU, DVL, depth, heading, fixes, detections, truth: those there are
     sequence = sg.recognise("dive.mcap")  # or: with landmarks recognised in its sonar images
     result = sg.run_estimator(sequence, "isam2")  # one estimator
     comparison = sg.compare(sequence, ["isam2", "ekf-slam", "dead-reckoning"])  # several, on the same measurements
@@ -56,7 +56,9 @@ detection       range, azimuth and identity posterior of a landmark in one sonar
 DVL             Doppler velocity log
 DVL gap         time without bottom lock, bridged by accelerometers or a random walk
 epoch           stamp of a DVL row at which motions begin and end
+fix             position of an antenna or transponder, from satellites or acoustics (USBL)
 gate            threshold on the squared Mahalanobis distance of an innovation
+heading         yaw of the body, measured by a compass, an attitude reference (AHRS) or a gyrocompass
 identity        number of a landmark; the recogniser gives a posterior over identities
 IMU hole        time without IMU rows
 innovation      measured minus predicted
@@ -86,7 +88,7 @@ if TYPE_CHECKING:
     from sonar_graph.evaluation import Comparison, RunResult, compare, run_estimator
     from sonar_graph.logs import inspect_log, read_log, write_log
     from sonar_graph.images import SonarFrames
-    from sonar_graph.measurements import Depth, Dvl, Imu, LandmarkDetections, Measurements
+    from sonar_graph.measurements import Depth, Dvl, Heading, Imu, LandmarkDetections, Measurements, PositionFixes
     from sonar_graph.navigation import Odometry
     from sonar_graph.recognition import recognise
     from sonar_graph.report import write_report
@@ -102,11 +104,13 @@ __all__ = [
     "Dvl",
     "Estimate",
     "Estimator",
+    "Heading",
     "Imu",
     "LandmarkDetections",
     "LandmarkMap",
     "Measurements",
     "Odometry",
+    "PositionFixes",
     "RunResult",
     "Sequence",
     "SonarFrames",

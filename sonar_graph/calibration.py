@@ -99,6 +99,24 @@ class DepthCalibration(Section):
     """The pressure port in the body frame."""
 
 
+class HeadingCalibration(Section):
+    """Compass, attitude reference or gyrocompass."""
+
+    sigma_rad: Positive = 0.02
+    """White noise of one sample, where the log has no variance."""
+    bias_sigma_rad: NotNegative = 0.05
+    """Error that all samples of a run share: deviation, declination, mounting; 0: none is estimated."""
+
+
+class PositionCalibration(Section):
+    """Satellite receiver, or acoustic positioning (USBL)."""
+
+    sigma_m: tuple[Positive, Positive, Positive] = (2.5, 2.5, 5.0)
+    """White noise of one fix along the world's axes, where the log has no covariance."""
+    antenna_m: Vector = (0.0, 0.0, 0.0)
+    """The antenna or transponder in the body frame."""
+
+
 class SonarImage(Section):
     """Scale of the samples of sonar images."""
 
@@ -170,6 +188,8 @@ class Calibration(Section):
     imu: ImuCalibration = ImuCalibration()
     dvl: DvlCalibration = DvlCalibration()
     depth: DepthCalibration = DepthCalibration()
+    heading: HeadingCalibration = HeadingCalibration()
+    positions: PositionCalibration = PositionCalibration()
     sonar: SonarCalibration = SonarCalibration()
     start: Start = Start()
     floor: FloorPrior | None = None

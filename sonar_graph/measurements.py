@@ -22,12 +22,14 @@ NS_PER_S = 1_000_000_000
 NO_TRACK = -1
 """Track number of a detection that belongs to no track."""
 ROUNDING = 1e-6
-"""Tolerance of a sum of posteriors above 1: single precision."""
+"""Tolerance of a sum of posteriors above 1, and of a covariance: single precision."""
 FIRST_TOO_LARGE_ID = 2**56
 """An identity is part of a variable's key in a graph, which has 56 bits for it."""
 ID_ADVICE = "number the landmarks from 0 on, such as 1, 2, 3, where identities are made (a hash has no place)"
 FARTHEST_M = 100_000.0
 """Largest range accepted; no sonar sees farther."""
+UNMEASURED_M2 = 1e8
+"""Variance of a coordinate that a position fix does not measure, such as a height: 10 km squared."""
 
 
 def no_posterior(probability: Floats) -> NDArray[np.bool_]:
@@ -176,6 +178,55 @@ class Depth(Block):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
+class Heading(Block):
+    """Yaw of the body in the world, by a compass, an attitude reference or a gyrocompass.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> heading = Heading(stamps_ns=np.array([0]), yaw_rad=np.array([1.57]), sigma_rad=np.array([np.nan]))
+    >>> heading.yaw_rad
+    array([1.57])
+    """
+
+    yaw_rad: Floats = field(metadata={"shape": (), "finite": True})
+    """Yaw of world_T_body = Rz(yaw) Ry(pitch) Rx(roll), positive to the left, whole turns do not matter, shape (n,)."""
+    sigma_rad: Floats = field(metadata={"shape": ()})
+    """Standard deviation of white noise, shape (n,); NaN where unknown: the calibration's value then holds."""
+
+    def are_sound(self) -> NDArray[np.bool_]:
+        """Mask, shape (n,), of rows whose sigma is positive and finite, or unknown."""
+        return np.asarray(np.isnan(self.sigma_rad) | ((self.sigma_rad > 0) & np.isfinite(self.sigma_rad)))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PositionFixes(Block):
+    """Positions of an antenna or acoustic transponder in the world, from satellites or an acoustic array (USBL).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> fixes = PositionFixes(np.array([0]), np.array([[12.0, -3.0, 0.0]]), np.diag([4.0, 4.0, 25.0])[None])
+    >>> fixes.are_sound()
+    array([ True])
+    """
+
+    position_m: Floats = field(metadata={"shape": (3,), "finite": True})
+    """Shape (n, 3); a coordinate that is not measured has a variance of `UNMEASURED_M2`."""
+    covariance_m2: Floats = field(metadata={"shape": (3, 3)})
+    """Along the world's axes, shape (n, 3, 3); NaN where unknown: the calibration's value then holds."""
+
+    def are_sound(self) -> NDArray[np.bool_]:
+        """Mask, shape (n,), of rows with a positive definite covariance (Sylvester's criterion) or none (NaN)."""
+        with np.errstate(all="ignore"):
+            sigmas = np.sqrt(np.einsum("nii->ni", self.covariance_m2))
+            correlations = self.covariance_m2 / (sigmas[:, :, None] * sigmas[:, None, :])
+            is_symmetric = np.abs(correlations - np.swapaxes(correlations, 1, 2)).max(axis=(1, 2)) <= ROUNDING
+            is_definite = (correlations[:, 0, 1] ** 2 < 1 - ROUNDING) & (np.linalg.det(correlations) > ROUNDING)
+        return np.asarray((is_symmetric & is_definite) | np.isnan(self.covariance_m2).any(axis=(1, 2)))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class LandmarkDetections(Block):
     """Landmarks recognised in sonar frames: one row per detection; rows of one frame share a stamp.
 
@@ -249,7 +300,7 @@ class Measurements:
     Raises
     ------
     MeasurementError
-        When ``end_ns`` is no integer, or a detection or depth sample is stamped after it.
+        When ``end_ns`` is no integer, or a row is stamped after it; rows of IMU and DVL may be.
 
     Examples
     --------
@@ -263,6 +314,8 @@ class Measurements:
     dvl: Dvl | None = None
     depth: Depth | None = None
     detections: LandmarkDetections | None = None
+    heading: Heading | None = None
+    positions: PositionFixes | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.end_ns, bool) or not isinstance(self.end_ns, (int, np.integer)):
@@ -270,7 +323,7 @@ class Measurements:
                 f"Measurements.end_ns: expected an integer, nanoseconds, not {self.end_ns!r}; of seconds:"
                 " round(seconds * 1e9)"
             )
-        for rows in (self.depth, self.detections):
+        for rows in (self.depth, self.detections, self.heading, self.positions):
             if rows is not None and rows.stamps_ns[-1] > self.end_ns:
                 raise MeasurementError(
                     f"Measurements: {type(rows).__name__} has a row at {rows.stamps_ns[-1]} ns, after end_ns ="

@@ -2,12 +2,24 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import MeasurementError
-from sonar_graph.measurements import NS_PER_S, Depth, Dvl, Imu, Ints, LandmarkDetections, Measurements
+from sonar_graph.measurements import (
+    NS_PER_S,
+    Block,
+    Depth,
+    Dvl,
+    Heading,
+    Imu,
+    Ints,
+    LandmarkDetections,
+    Measurements,
+    PositionFixes,
+)
 from sonar_graph.states import LandmarkMap, Trajectory
 
 
@@ -40,15 +52,20 @@ class Sequence:
     truth: Trajectory | None = None
     """Reference poses of the body; `notes` says where they come from."""
     true_landmarks: LandmarkMap | None = None
+    heading: Heading | None = None
+    positions: PositionFixes | None = None
     notes: dict[str, str] = field(default_factory=dict)
     """Provenance by subject: data set, licence, options of a simulation, seed."""
 
     def __repr__(self) -> str:
-        blocks = {
-            name: getattr(self, name) for name in ("imu", "dvl", "depth", "detections", "truth", "true_landmarks")
-        }
-        rows = (f"{len(block)} {name}" for name, block in blocks.items() if block is not None)
+        known = self.blocks() | {"truth": self.truth, "true_landmarks": self.true_landmarks}
+        rows = (f"{len(block)} {name}" for name, block in known.items() if block is not None)
         return f"Sequence({self.name!r}: {self.duration_s:.1f} s, {', '.join(rows)})"
+
+    def blocks(self) -> dict[str, Block]:
+        """Measurements that there are, by their names in `Measurements`."""
+        names = ("imu", "dvl", "depth", "detections", "heading", "positions")
+        return {name: block for name in names if (block := getattr(self, name)) is not None}
 
     @property
     def start_ns(self) -> int:
@@ -89,13 +106,8 @@ class Sequence:
         """Measurements between successive instants; the first item holds everything up to the first instant."""
         after_ns = np.iinfo(np.int64).min
         for end_ns in instants_ns.tolist():
-            yield Measurements(
-                end_ns,
-                self.imu.between(after_ns, end_ns),
-                self.dvl.between(after_ns, end_ns),
-                self.depth.between(after_ns, end_ns) if self.depth else None,
-                self.detections.between(after_ns, end_ns) if self.detections else None,
-            )
+            rows: dict[str, Any] = {name: block.between(after_ns, end_ns) for name, block in self.blocks().items()}
+            yield Measurements(end_ns, **rows)
             after_ns = end_ns
 
 

@@ -223,7 +223,7 @@ class DetectionLog:
 
 
 class Refusal(StrEnum):
-    """Reason for which a row of IMU, Doppler log or depth sensor is not used."""
+    """Reason for which a row of a sensor is not used."""
 
     OUTLIER = "refused: no vehicle reaches this velocity from the last"
     LATE = "refused: the motion that it belongs to was already used"
@@ -237,7 +237,7 @@ class RefusedRow(NamedTuple):
     """Row of a sensor that is not used, with the reason."""
 
     sensor: str
-    """``imu``, ``dvl`` or ``depth``."""
+    """``imu``, ``dvl``, ``depth``, ``heading`` or ``positions``."""
     stamp_ns: int
     reason: Refusal
     distance: float

@@ -132,6 +132,21 @@ def see_to_the_right(self: PlainDeadReckoning, block: LandmarkDetections, i: int
     block.azimuth_rad[i] *= -1
 
 
+def heading_to_the_right(self: PlainDeadReckoning, measurements: Measurements) -> Estimate | None:
+    """The vehicle is turned about its own place to minus the newest heading."""
+    if measurements.heading is not None and self.stamp_ns is not None:
+        yaw_rad = -measurements.heading.yaw_rad[-1]
+        self.pose = gtsam.Pose3(gtsam.Rot3.Yaw(yaw_rad), self.pose.translation())
+    return PlainDeadReckoning.process(self, measurements)
+
+
+def antenna_as_body(self: PlainDeadReckoning, measurements: Measurements) -> Estimate | None:
+    """The newest fix is the body's place, as if there were no lever arm."""
+    if measurements.positions is not None and self.stamp_ns is not None:
+        self.pose = gtsam.Pose3(self.pose.rotation(), measurements.positions.position_m[-1])
+    return PlainDeadReckoning.process(self, measurements)
+
+
 def unsorted_map(self: PlainDeadReckoning) -> LandmarkMap:
     found = PlainDeadReckoning.landmarks(self)
     return LandmarkMap(found.ids[::-1], found.positions[::-1], found.covariances[::-1])
@@ -179,6 +194,8 @@ BROKEN: list[tuple[str, Check, dict[str, Any]]] = [
     ),
     ("turns right", laws.frames_and_signs_are_those_of_the_vocabulary, driving(turn=-1.0)),
     ("azimuth to the right", laws.frames_and_signs_are_those_of_the_vocabulary, {"_see": see_to_the_right}),
+    ("heading to the right", laws.frames_and_signs_are_those_of_the_vocabulary, {"process": heading_to_the_right}),
+    ("no lever arm", laws.frames_and_signs_are_those_of_the_vocabulary, {"process": antenna_as_body}),
     ("unsorted map", laws.landmarks_are_sorted_and_unique, {"landmarks": unsorted_map}),
     ("silent about refusals", laws.every_detection_has_an_outcome, {"detections": only_used}),
     ("differs from run to run", laws.same_input_gives_same_output, begin_anew(step_m=1e-12)),

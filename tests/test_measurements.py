@@ -13,9 +13,11 @@ from sonar_graph.measurements import (
     FIRST_TOO_LARGE_ID,
     Depth,
     Dvl,
+    Heading,
     Imu,
     LandmarkDetections,
     Measurements,
+    PositionFixes,
     no_posterior,
     possible_ranges,
 )
@@ -127,6 +129,9 @@ def test_stamps_that_are_no_row_of_integers_are_refused(stamps, expected):
         (lambda n: Dvl(n, np.zeros((5, 3)), np.zeros((5, 3))), r"Dvl.velocity_cov: expected shape (5, 3, 3)"),
         (lambda n: Dvl(n[:3], np.zeros((3, 3)), np.eye(3)), r"Dvl.velocity_cov: expected shape (3, 3, 3)"),
         (lambda n: Depth(n, np.zeros((5, 1)), np.zeros(5)), r"Depth.z_m: expected shape (5,), not (5, 1)"),
+        (lambda n: Heading(n, np.zeros((5, 1)), np.zeros(5)), r"Heading.yaw_rad: expected shape (5,), not (5, 1)"),
+        (lambda n: PositionFixes(n, np.zeros((5, 2)), np.zeros((5, 3, 3))), r"position_m: expected shape (5, 3)"),
+        (lambda n: PositionFixes(n, np.zeros((5, 3)), np.zeros((5, 3))), r"covariance_m2: expected shape (5, 3, 3)"),
         (
             lambda n: LandmarkDetections(n, n, n, np.zeros((5, 2)), np.zeros((5, 1)), np.ones((5, 1))),
             r"LandmarkDetections.range_azimuth_cov: expected shape (5, 2, 2), not (5, 2)",
@@ -222,3 +227,27 @@ def test_the_largest_identity_is_the_last_that_a_key_gives_back():
     assert gtsam.Symbol(gtsam.symbol("l", largest)).index() == largest
     with pytest.raises((ValueError, RuntimeError)):
         gtsam.symbol("l", FIRST_TOO_LARGE_ID)
+
+
+@pytest.mark.parametrize(
+    "block",
+    [depth([3, 5]), Heading([3, 5], [0, 0], [1, 1]), PositionFixes([3, 5], np.zeros((2, 3)), np.ones((2, 3, 3)))],
+)  # type: ignore[list-item]
+def test_rows_after_the_end_of_a_call_are_refused_by_name(block):
+    name = {Depth: "depth", Heading: "heading", PositionFixes: "positions"}[type(block)]
+    assert len(getattr(Measurements(5, **{name: block}), name)) == 2
+    with pytest.raises(MeasurementError, match=rf"{type(block).__name__} has a row at 5 ns, after end_ns = 4"):
+        Measurements(4, **{name: block})
+
+
+def test_heading_and_fixes_tell_the_rows_whose_noise_cannot_be():
+    """Unknown noise (NaN) is none of them, and of a covariance only what rounding of single precision explains."""
+    sigmas = [np.nan, 0.01, 0.0, -1.0, np.inf]
+    assert Heading(np.arange(5), np.zeros(5), np.array(sigmas)).are_sound().tolist() == [True, True, *[False] * 3]
+    good = np.array([[4.0, 1.9, 0.0], [1.9, 1.0, 0.0], [0.0, 0.0, 1e8]])
+    skew, indefinite, infinite, unknown = good.copy(), good.copy(), good.copy(), good.copy()
+    skew[0, 1], infinite[2, 2], unknown[0, 0] = 1.8, np.inf, np.nan
+    indefinite[0, 1] = indefinite[1, 0] = 2.1
+    covs = np.stack([good, 1e-9 * good, good.astype(np.float32), unknown, skew, indefinite, infinite, -good, 0 * good])
+    fixes = PositionFixes(np.arange(9), np.zeros((9, 3)), covs)
+    assert fixes.are_sound().tolist() == [True] * 4 + [False] * 5

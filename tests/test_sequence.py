@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import MeasurementError
-from sonar_graph.measurements import NS_PER_S, Depth, Dvl, Imu
+from sonar_graph.measurements import NS_PER_S, Depth, Dvl, Heading, Imu, PositionFixes
 from sonar_graph.sequence import Sequence
 
 
@@ -26,6 +26,8 @@ def recording(imu_s: tuple[float, float] = (0.0, 10.0), dvl_s: tuple[float, floa
         Imu(imu, np.zeros((len(imu), 3)), np.zeros((len(imu), 3))),
         Dvl(dvl, np.zeros((len(dvl), 3)), np.full((len(dvl), 3, 3), np.nan)),
         Depth(depth, np.zeros(len(depth)), np.full(len(depth), np.nan)),
+        heading=Heading(depth + 1, np.zeros(len(depth)), np.full(len(depth), np.nan)),
+        positions=PositionFixes(dvl + 2, np.zeros((len(dvl), 3)), np.full((len(dvl), 3, 3), np.nan)),
     )
 
 
@@ -57,7 +59,7 @@ def test_replay_hands_out_every_row_once_and_in_time(rate_hz):
     sequence = recording()
     steps = list(sequence.replay(sequence.instants(rate_hz)))
     last_ns = steps[-1].end_ns
-    for name in ("imu", "dvl", "depth"):
+    for name in ("imu", "dvl", "depth", "heading", "positions"):
         handed = [getattr(step, name).stamps_ns for step in steps if getattr(step, name) is not None]
         all_stamps = getattr(sequence, name).stamps_ns
         np.testing.assert_array_equal(np.concatenate(handed), all_stamps[all_stamps <= last_ns])

@@ -3,14 +3,13 @@
 In the turn body velocity and angular rate are constant, so that the truth is a circle in closed form.
 """
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.calibration import Calibration, ImuCalibration, Start
-from sonar_graph.measurements import NS_PER_S, Block, Depth, Dvl, Floats, Imu, Ints, LandmarkDetections
+from sonar_graph.calibration import Calibration, ImuCalibration, PositionCalibration, Start
+from sonar_graph.measurements import NS_PER_S, Depth, Dvl, Floats, Heading, Imu, Ints, LandmarkDetections, PositionFixes
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import LandmarkMap, Trajectory
 
@@ -22,7 +21,7 @@ YAW_RATE_RAD_S = 0.05
 HEIGHT_M = -0.5
 LANDMARKS_M = {4: (7.0, 3.0), 9: (3.0, 7.0), 11: (5.5, 5.5)}
 STILL_START = Start(position_m=(1.0, -2.0, HEIGHT_M), rpy_rad=(0.1, -0.05, 0.7))
-IMU_HZ, DVL_HZ, DEPTH_HZ, FRAME_HZ = 50, 5, 5, 2
+IMU_HZ, DVL_HZ, DEPTH_HZ, FRAME_HZ, HEADING_HZ, FIX_HZ = 50, 5, 5, 2, 5, 1
 SEED = 20
 TRACK_FRAMES = 4
 MISNAMED_FRAMES = 8
@@ -55,6 +54,28 @@ def small_world(dvl_delay_s: float = 0.0) -> Sequence:
         detections=_detections(calibration, noise),
         truth=_circle(_stamps(0, IMU_HZ, DURATION_S)),
         true_landmarks=_true_landmarks(),
+    )
+
+
+def aided_world() -> Sequence:
+    """Left turn with heading and position fixes as well, of which every second row states its noise."""
+    world, noise = small_world(), np.random.default_rng(SEED)
+    calibration = world.calibration.model_copy(
+        update={"positions": PositionCalibration(sigma_m=(0.5, 0.5, 1.0), antenna_m=(-0.4, 0.2, 0.6))}
+    )
+    heading_ns, fixes_ns = _stamps(0, HEADING_HZ, DURATION_S) + NS_PER_S // 7, _stamps(0, FIX_HZ, DURATION_S)
+    m, n = len(heading_ns), len(fixes_ns)
+    yaw_rad = YAW_RATE_RAD_S * (heading_ns - START_NS) * 1e-9 + calibration.heading.sigma_rad * noise.standard_normal(m)
+    body = _circle(fixes_ns)
+    antenna = body.positions + body.rotations().apply(calibration.positions.antenna_m)
+    fixes = antenna + calibration.positions.sigma_m * noise.standard_normal((n, 3))
+    covs = np.tile(np.diag(np.square(calibration.positions.sigma_m)), (n, 1, 1))
+    return replace(
+        world,
+        name="left turn with heading and fixes",
+        calibration=calibration,
+        heading=Heading(heading_ns, yaw_rad, np.where(np.arange(m) % 2, calibration.heading.sigma_rad, np.nan)),
+        positions=PositionFixes(fixes_ns, fixes, np.where((np.arange(n) % 2)[:, None, None], covs, np.nan)),
     )
 
 
@@ -97,15 +118,8 @@ def still_world() -> Sequence:
 
 def every_stamp(sequence: Sequence) -> Ints:
     """Stamps of all measurements after the start until the end, shape (n,)."""
-    stamps_ns = np.unique(np.concatenate([block.stamps_ns for block in blocks(sequence)]))
+    stamps_ns = np.unique(np.concatenate([block.stamps_ns for block in sequence.blocks().values()]))
     return stamps_ns[(stamps_ns > sequence.start_ns) & (stamps_ns <= sequence.end_ns)]
-
-
-def blocks(sequence: Sequence) -> Iterator[Block]:
-    """Blocks that a sequence has."""
-    for block in (sequence.imu, sequence.dvl, sequence.depth, sequence.detections):
-        if block is not None:
-            yield block
 
 
 def _stamps(first_s: float, rate_hz: int, until_s: int) -> Ints:

@@ -30,11 +30,10 @@ from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Trajectory
 from sonar_graph.testing.drives import (
-    DURATION_S,
     LANDMARKS_M,
     START_NS,
     STILL_START,
-    blocks,
+    aided_world,
     every_stamp,
     misnamed_world,
     small_world,
@@ -228,7 +227,7 @@ def answers_from_the_first_imu_and_dvl_on(make: MakeEstimator) -> None:
 
 def covariances_are_covariances(make: MakeEstimator) -> None:
     """Covariances of poses and landmarks are finite, symmetric, positive semi-definite, 6 × 6 and 3 × 3."""
-    outcome = run(make, small_world())
+    outcome = run(make, aided_world())
     for estimate in outcome.estimates:
         require_covariance(estimate.covariance, 6, "covariance of an estimate")
     for covariance in outcome.trajectory.covariances:
@@ -249,19 +248,17 @@ def frames_and_signs_are_those_of_the_vocabulary(make: MakeEstimator) -> None:
 
     Their height is left out: elevation is not measured.
     """
-    world = small_world()
-    outcome = run(make, world)
-    assert world.truth is not None
-    assert world.true_landmarks is not None
-    off_m = np.linalg.norm(
-        outcome.trajectory.positions - world.truth.at(outcome.trajectory.stamps_ns).positions, axis=1
-    )
-    require(off_m.max() < 0.3, f"the trajectory leaves the truth by {off_m.max():.2f} m in {DURATION_S} s")
-    known = np.isin(world.true_landmarks.ids, outcome.landmarks.ids)
-    if not known.any():
-        return
-    off_m = np.linalg.norm((outcome.landmarks.positions - world.true_landmarks.positions[known])[:, :2], axis=1)
-    require(off_m.max() < 0.5, f"a landmark is {off_m.max():.2f} m from the truth, horizontally")
+    for world in (small_world(), aided_world()):
+        outcome = run(make, world)
+        assert world.truth is not None
+        assert world.true_landmarks is not None
+        truth = world.truth.at(outcome.trajectory.stamps_ns)
+        off_m = np.linalg.norm(outcome.trajectory.positions - truth.positions, axis=1)
+        require(off_m.max() < 0.3, f"{world.name}: the trajectory leaves the truth by {off_m.max():.2f} m")
+        known = np.isin(world.true_landmarks.ids, outcome.landmarks.ids)
+        if known.any():
+            off_m = np.linalg.norm((outcome.landmarks.positions - world.true_landmarks.positions[known])[:, :2], axis=1)
+            require(off_m.max() < 0.5, f"{world.name}: a landmark is {off_m.max():.2f} m from the truth, horizontally")
 
 
 def landmarks_are_sorted_and_unique(make: MakeEstimator) -> None:
@@ -295,7 +292,7 @@ def asking_changes_nothing(make: MakeEstimator) -> None:
 
     Also where identities are wrong or missing, and an estimator may revise them when it is asked.
     """
-    for world, every in ((small_world(), 1), (misnamed_world(), 3), (misnamed_world(is_tracked=True), 7)):
+    for world, every in ((aided_world(), 1), (misnamed_world(), 3), (misnamed_world(is_tracked=True), 7)):
         differing = unlike(run(make, world), run(make, world, ask_every=every))
         require(not differing, f"asking after every {every} steps changes {', '.join(differing)}")
 
@@ -306,7 +303,7 @@ def live_agrees_with_replay(make: MakeEstimator) -> None:
     An estimator that iterates may linearise elsewhere when it is called more often. A deviation beyond a standard
     deviation, or another covariance, shows that something was counted twice or lost.
     """
-    world = small_world()
+    world = aided_world()
     windows, live = run(make, world), run(make, world, every_stamp(world))
     mean, covariance = deviation(windows, live)
     require(mean < LIVE_SIGMAS, f"cut row by row the estimate moves by {mean:.2f} of its standard deviation")
@@ -315,16 +312,16 @@ def live_agrees_with_replay(make: MakeEstimator) -> None:
 
 def live_equals_replay(make: MakeEstimator) -> None:
     """Rows that arrive one by one give the same result to rounding; for estimators that never iterate."""
-    world = small_world()
+    world = aided_world()
     differ = difference(run(make, world), run(make, world, every_stamp(world)))
     require(differ < SAME, f"cut row by row the outcome differs by {differ:.1e}")
 
 
 def input_stays_as_it_was(make: MakeEstimator) -> None:
     """No array of the measurements is written to."""
-    world, untouched = small_world(), small_world()
+    world, untouched = aided_world(), aided_world()
     run(make, world)
-    for block, before in zip(blocks(world), blocks(untouched), strict=True):
+    for block, before in zip(world.blocks().values(), untouched.blocks().values(), strict=True):
         for field in fields(block):
             same = np.array_equal(getattr(block, field.name), getattr(before, field.name), equal_nan=True)
             require(same, f"{type(block).__name__}.{field.name} was changed")
