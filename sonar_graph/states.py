@@ -61,7 +61,7 @@ class Trajectory:
     positions: Floats
     """Origin of the body in the world, shape (n, 3), metres."""
     quaternions_xyzw: Floats
-    """world_R_body, shape (n, 4), unit length, scalar last."""
+    """world_R_body, shape (n, 4), unit length, scalar last; NaN where only positions are known."""
     covariances: Floats
     """Covariances of the body-frame perturbation [rotation, translation], shape (n, 6, 6); NaN where unknown."""
 
@@ -93,14 +93,26 @@ class Trajectory:
         """Trajectory of unknown uncertainty, such as a reference."""
         return cls(stamps_ns, positions, quaternions_xyzw, np.full((len(stamps_ns), 6, 6), np.nan))
 
+    @classmethod
+    def of_positions(cls, stamps_ns: Ints, positions: Floats) -> Trajectory:
+        """Reference of positions only, such as from satellites: orientations are not known (NaN)."""
+        return cls.without_covariances(stamps_ns, positions, np.full((len(stamps_ns), 4), np.nan))
+
+    @property
+    def has_orientation(self) -> bool:
+        """True where orientations are known, not only positions."""
+        return not np.isnan(self.quaternions_xyzw).any()
+
     def rotations(self) -> Rotation:
-        """world_R_body of every row."""
+        """world_R_body of every row; a `MeasurementError` where only positions are known."""
+        if not self.has_orientation:
+            raise MeasurementError("Trajectory: only its positions are known; see has_orientation")
         return Rotation.from_quat(self.quaternions_xyzw)
 
     @cached_property
     def matrices(self) -> Floats:
-        """world_R_body of every row, shape (n, 3, 3), computed once."""
-        return np.asarray(self.rotations().as_matrix())
+        """world_R_body of every row, shape (n, 3, 3), computed once; NaN where only positions are known."""
+        return np.asarray(self.rotations().as_matrix()) if self.has_orientation else np.full((len(self), 3, 3), np.nan)
 
     def rows(self, selection: slice | Ints) -> Trajectory:
         """The trajectory with only the selected rows."""
@@ -117,9 +129,11 @@ class Trajectory:
         before = after - 1
         interval_ns = np.maximum(self.stamps_ns[after] - self.stamps_ns[before], 1)
         share = ((stamps_ns - self.stamps_ns[before]) / interval_ns)[:, None]
+        positions = self.positions[before] + share * (self.positions[after] - self.positions[before])
+        if not self.has_orientation:
+            return Trajectory.of_positions(stamps_ns, positions)
         start, end = Rotation.from_quat(self.quaternions_xyzw[before]), Rotation.from_quat(self.quaternions_xyzw[after])
         quaternions = (start * Rotation.from_rotvec(share * (start.inv() * end).as_rotvec())).as_quat()
-        positions = self.positions[before] + share * (self.positions[after] - self.positions[before])
         return Trajectory.without_covariances(stamps_ns, positions, quaternions)
 
 

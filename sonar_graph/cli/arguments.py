@@ -74,7 +74,7 @@ class ReadingOptions:
             "--topic",
             metavar="ROLE=TOPIC",
             help="Topic for a role, where inspect says that several fit or none; may be repeated. "
-            "Roles: imu, dvl, depth, detections, truth, true_landmarks, sonar.",
+            "Roles: imu, dvl, depth, heading, positions, detections, truth, true_landmarks, sonar.",
         ),
     ] = None
     log_config: Annotated[

@@ -17,7 +17,7 @@ from sonar_graph.logs.cdr import Struct, decode, definition, parse_definition, s
 from sonar_graph.logs.checks import stamp_faults
 from sonar_graph.logs.mcap import STAMP_BYTES, Keep, Recording, TimeWindow, Topic, scan
 from sonar_graph.logs.reading import Assembly, describe_frames, read_sonar_frames
-from sonar_graph.logs.roles import ROLES, SEQUENCE_ROLES, SONAR, TF, Choice, choose_topic, refusal, wanted_types
+from sonar_graph.logs.roles import ROLES, SEQUENCE_ROLES, SONAR, TF, Choice, choose_each, refusal, wanted_types
 from sonar_graph.logs.vehicle_setup import read_calibration, read_notes, recorded_name, static_frames
 from sonar_graph.measurements import NS_PER_S, Ints
 
@@ -168,7 +168,7 @@ def inspect_log(
         as_path(path, "inspect_log(path)"), lambda kind: Keep.ALL if short_name(kind) in types else Keep.STAMP, window
     )
     damage = [*recording.corrupt, *([recording.ending] if recording.ending else []), *recording.damage.remarks]
-    choices = {name: choose_topic(role, recording, config, (topics or {}).get(name)) for name, role in ROLES.items()}
+    choices = choose_each(recording, topics or {}, config, ROLES)
     calibration = _calibration_source(recording)
     try:
         notes = read_notes(recording)

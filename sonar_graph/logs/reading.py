@@ -11,17 +11,20 @@ from typing import Any
 
 import numpy as np
 
-from sonar_graph.calibration import Calibration
+from sonar_graph.calibration import Calibration, Mounting
 from sonar_graph.errors import LogError
 from sonar_graph.files import as_path
 from sonar_graph.images import SonarFrames
 from sonar_graph.logs.adapters import (
     DepthAdapter,
     Dropped,
+    HeadingAdapter,
     LogConfig,
     MessageTable,
+    PositionAdapter,
     Refused,
     SonarAdapter,
+    TruthAdapter,
     changes_text,
     detection_warnings,
     shipped_like,
@@ -36,6 +39,7 @@ from sonar_graph.logs.checks import (
     stamp_faults,
     stuck_warning,
 )
+from sonar_graph.logs.geodesy import Origin
 from sonar_graph.logs.mcap import Keep, Progress, Recording, TimeWindow, scan, stream
 from sonar_graph.logs.roles import ROLES, SEQUENCE_ROLES, SONAR, Choice, choose_topics, wanted_types
 from sonar_graph.logs.vehicle_setup import (
@@ -48,11 +52,20 @@ from sonar_graph.logs.vehicle_setup import (
     recorded_name,
     static_frames,
 )
-from sonar_graph.measurements import Block, Depth, Dvl, Floats, Imu, LandmarkDetections
+from sonar_graph.measurements import Block, Dvl, Imu
 from sonar_graph.sequence import Sequence
 
 FOUND_ANEW = frozenset({"log.warnings", "log.gaps", "log.noise"})
 """Notes about the rows of a log; those of an earlier reading may no longer hold."""
+
+NOISE_FIELDS = {
+    "dvl": ("velocity_cov", "dvl.velocity_sigma_m_s"),
+    "depth": ("variance_m2", "depth.sigma_m"),
+    "heading": ("sigma_rad", "heading.sigma_rad"),
+    "positions": ("covariance_m2", "positions.sigma_m"),
+    "detections": ("range_azimuth_cov", "sonar.range_sigma_m and azimuth_sigma_rad"),
+}
+"""Column of each block that says its noise, and the calibration's fields that count where it is NaN."""
 
 
 def read_log(
@@ -82,8 +95,8 @@ def read_log(
     name
         Name of the sequence, instead of the one in the file; without either, the file's name.
     topics
-        Topics by role (``imu``, ``dvl``, ``depth``, ``detections``, ``truth``, ``true_landmarks``), where several
-        fit or none is found by type and name; they go before those of `config`.
+        Topics by role (``imu``, ``dvl``, ``depth``, ``heading``, ``positions``, ``detections``, ``truth``,
+        ``true_landmarks``), where several fit or none is found by type and name; they go before those of `config`.
     config
         Description of the topics of a foreign log; `read_log_config` reads one from a TOML file.
     window
@@ -199,10 +212,13 @@ class Assembly:
         stated = mounted_by(recorded.model_dump(exclude_unset=True)) if recorded else set()
         stated |= mounted_by(given.values) if given else set()
         frames = {
-            role: self._adapters[role].frame_in(table.groups) for role, table in self._tables.items() if role != "truth"
+            role: self._adapters[role].frame_in(table.groups)
+            for role, table in self._tables.items()
+            if role not in ("truth", "heading")
         }
-        if not frames.get("depth", "depth"):
-            del frames["depth"]  # a pose in the world: there is no port to mount
+        for role in ("depth", "positions"):
+            if not frames.get(role, role):
+                del frames[role]  # in the world: there is no port or antenna to mount
         if "detections" in self._topics and (messages := self._topics["detections"].messages()):
             frames["sonar"] = self._adapters["detections"].frame_in(messages)
         tree = static_frames(self._recording)
@@ -233,11 +249,45 @@ class Assembly:
             if assumption := adapter.assumption(gravity_m_s2):
                 self._notes["log.depth"] = assumption
             self._blocks[role], dropped = adapter.read(source, gravity_m_s2)
+        elif isinstance(adapter, HeadingAdapter):
+            self._blocks[role], dropped = adapter.read(source, self._heading_mounting().pose().rotation().matrix())
+        elif isinstance(adapter, PositionAdapter):
+            self._blocks[role], dropped = adapter.read(source, self._origin(), self.calibration.positions.sigma_m)
+        elif isinstance(adapter, TruthAdapter):
+            self._blocks[role], dropped = adapter.read(source, self._origin())
         else:
             self._blocks[role], dropped = adapter.read(source)
         if dropped := topic.unsound | dropped:
             self._dropped[role] = dropped
         return self._blocks[role]
+
+    def _heading_mounting(self) -> Mounting:
+        """Mounting of the sensor of an orientation: the IMU's where it is its topic, else that of its frame."""
+        if self._topics["heading"] is self._topics.get("imu"):
+            return self.calibration.imu.mounting
+        frame = self._adapters["heading"].frame_in(self._tables["heading"].groups)
+        return mounting_of(frame, static_frames(self._recording)) or Mounting()
+
+    def _origin(self) -> Origin | None:
+        """Origin of the world in degrees and metres: the configured one, or the first fix; None without any.
+
+        The note ``log.origin`` has it.
+        """
+        of_earth = {
+            role: adapter.geodetic
+            for role in ("positions", "truth")
+            if role in self._tables and (adapter := self._adapters[role]).geodetic is not None
+        }
+        said = [fields.origin_deg_m for fields in of_earth.values() if fields.origin_deg_m is not None]
+        found = [fix for role, fields in of_earth.items() if (fix := fields.first_fix(self._tables[role])) is not None]
+        if not said and not found:
+            return None
+        latitude_deg, longitude_deg, height_m = origin = (said or found)[0]
+        self._notes["log.origin"] = (
+            f"of the world, x east, y north: latitude {latitude_deg:.8f}°, longitude {longitude_deg:.8f}°, height "
+            f"{height_m:.3f} m, {'as configured' if said else 'the first fix'}"
+        )
+        return origin
 
     def sequence(self, name: str | None = None) -> Sequence:
         """Everything that was chosen as one sequence, called ``name``, or as the log calls itself, or like the file.
@@ -260,7 +310,7 @@ class Assembly:
             "log.stamps": stamps,
             "log.warnings": list(self.warnings()),
             "log.gaps": list(gap_warnings(blocks["imu"], blocks["dvl"], self.calibration)),
-            "log.noise": list(unsaid_noise(blocks["dvl"], blocks["depth"], blocks["detections"])),
+            "log.noise": list(unsaid_noise(blocks)),
         }
         self._notes |= {subject: "; ".join(texts) for subject, texts in findings.items() if texts}
         name = name or recorded_name(self._recording) or self._recording.path.stem
@@ -323,18 +373,14 @@ def _span(rows: Block) -> str:
     return f"from {rows.stamps_ns[0] * 1e-9:.3f} to {rows.stamps_ns[-1] * 1e-9:.3f} s"
 
 
-def unsaid_noise(dvl: Dvl, depth: Depth | None, detections: LandmarkDetections | None) -> Iterator[str]:
-    """Sensors with rows of unknown covariance, for which the noise of the calibration counts."""
-    columns: list[tuple[str, Floats, str]] = [("dvl", dvl.velocity_cov, "dvl.velocity_sigma_m_s")]
-    if depth is not None:
-        columns.append(("depth", depth.variance_m2, "depth.sigma_m"))
-    if detections is not None:
-        fields = "sonar.range_sigma_m and azimuth_sigma_rad"
-        columns.append(("detections", detections.range_azimuth_cov, fields))
-    for role, covariances, fields in columns:
-        count = np.count_nonzero(np.isnan(covariances.reshape(len(covariances), -1)).any(axis=1))
-        if count:
-            yield f"{role}: {count} of {len(covariances)} rows say no covariance, {fields} of the calibration count"
+def unsaid_noise(blocks: Mapping[str, Any]) -> Iterator[str]:
+    """Sensors with rows of unknown covariance, for which the noise of the calibration counts; blocks by role."""
+    for role, (column, fields) in NOISE_FIELDS.items():
+        if (block := blocks.get(role)) is not None:
+            covariances = getattr(block, column)
+            count = np.count_nonzero(np.isnan(covariances.reshape(len(covariances), -1)).any(axis=1))
+            if count:
+                yield f"{role}: {count} of {len(covariances)} rows say no covariance, {fields} of the calibration count"
 
 
 def read_sonar_frames(

@@ -1,14 +1,14 @@
 """Roles and the topics that play them, chosen by the user or found by message type and, where that is general, name.
 
-A role is a part of a `Sequence` (IMU, Doppler log, depth, detections, truth) or the sonar images. Every choice comes
-with its reason, for notes, error messages and `inspect_log` (docs/design/0004-logs.md).
+A role is a part of a `Sequence` (IMU, Doppler log, depth, heading, fixes, detections, truth) or the sonar images. Every
+choice comes with its reason, for notes, error messages and `inspect_log` (docs/design/0004-logs.md).
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from sonar_graph.errors import LogError, MissingTopicError
-from sonar_graph.logs.adapters import SHIPPED, Adapter, LogConfig, Shipped, shipped_for
+from sonar_graph.logs.adapters import SHIPPED, TRUTH_WORDS, Adapter, LogConfig, Shipped, shipped_for
 from sonar_graph.logs.cdr import parse_definition, short_name
 from sonar_graph.logs.mcap import Recording, Topic
 
@@ -19,6 +19,8 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 DETECTIONS = "sonar_graph_msgs/msg/LandmarkDetections"
 LANDMARK_MAP = "sonar_graph_msgs/msg/LandmarkMap"
 SONAR_IMAGE = "marine_acoustic_msgs/msg/ProjectedSonarImage"
+HEADING = "sonar_graph_msgs/msg/Heading"
+POINT = "geometry_msgs/msg/PointStamped"
 TF = "tf2_msgs/msg/TFMessage"
 SONAR = "sonar"
 """The role of sonar images."""
@@ -43,9 +45,13 @@ class Role:
             for words, names in by_words.items()
         )
 
+    def may_play(self, topic: Topic) -> bool:
+        """Tell whether a topic's name allows the role: what is called truth is no measurement."""
+        return self.name in ("truth", "true_landmarks") or not any(word in topic.name.lower() for word in TRUTH_WORDS)
+
     def fits(self, topic: Topic, *, general: bool) -> bool:
         """Tell whether a topic fits one of the shipped adapters, of those that are general or of the others."""
-        return any(
+        return self.may_play(topic) and any(
             short_name(offer.adapter.type) == short_name(topic.type_name)
             and (not offer.words or any(word in topic.name.lower() for word in offer.words))
             for offer in self.shipped
@@ -119,7 +125,7 @@ def adapter_for(role: Role, topic: Topic, config: LogConfig) -> Adapter | str:
     for adapter in config.adapters(role.name, topic.type_name):
         lacking = adapter.missing_in(topic.definition())
         if not lacking:
-            return adapter
+            return adapter.refusal(topic) or adapter
     if lacking:
         return f"has no field {', '.join(lacking)}"
     if others := [other for other in ROLES if shipped_for(other, topic.type_name)]:
@@ -155,7 +161,8 @@ def choose_topic(role: Role, recording: Recording, config: LogConfig = _DEFAULTS
         meant = telling + general
         found = _only(role, recording, config, telling) or _only(role, recording, config, general)
         if found is None:
-            others = tuple(t.name for t in topics.values() if not isinstance(adapter_for(role, t, config), str))
+            allowed = [topic for topic in topics.values() if role.may_play(topic)]
+            others = tuple(t.name for t in allowed if not isinstance(adapter_for(role, t, config), str))
             hint = f"; {', '.join(others)} only if chosen: --topic {role.name}={others[0]}" if others else ""
             found = Choice(role, None, f"no {role.describe()}{hint}", could_be=others)
         choice = found
@@ -179,6 +186,35 @@ def _only(role: Role, recording: Recording, config: LogConfig, fitting: list[Top
     return Choice(role, None, "; ".join(reasons)) if reasons else None
 
 
+_OF_THE_DRIVER = ("stamp", "stamp_unit_s", "stamp_offset_s", "frame_id_field", "frame_id", "rotation")
+"""Settings of an adapter that hold for all that one message brings."""
+
+
+def choose_each(
+    recording: Recording,
+    wanted: Mapping[str, str],
+    config: LogConfig = _DEFAULTS,
+    roles: Iterable[str] = SEQUENCE_ROLES,
+) -> dict[str, Choice]:
+    """Choose the topic for each role (`choose_topic`).
+
+    Of several orientations that of the topic in use as IMU is the heading, with the stamps and axes said of the IMU.
+    """
+    choices = {name: choose_topic(ROLES[name], recording, config, wanted.get(name)) for name in roles}
+    imu, heading = choices.get("imu"), choices.get("heading")
+    if imu is None or imu.topic is None or heading is None:
+        return choices
+    if imu.topic in heading.candidates:
+        adapter = adapter_for(heading.role, recording.topics[imu.topic], config)
+        if not isinstance(adapter, str):
+            heading = Choice(heading.role, imu.topic, "the orientation of the topic in use as IMU", adapter)
+    if heading.topic == imu.topic and heading.adapter is not None:
+        unsaid = [key for key in _OF_THE_DRIVER if key not in config.table("heading")]
+        adapter = heading.adapter.model_copy(update={key: getattr(imu.adapter, key) for key in unsaid})
+        heading = replace(heading, adapter=adapter)
+    return choices | {"heading": heading}
+
+
 def choose_topics(
     recording: Recording,
     wanted: Mapping[str, str],
@@ -193,7 +229,7 @@ def choose_topics(
     path, unknown = recording.path, wanted.keys() - ROLES.keys()
     if unknown:
         raise LogError(f"there is no role {', '.join(sorted(unknown))}; topics are chosen for {', '.join(ROLES)}")
-    choices = {name: choose_topic(ROLES[name], recording, config, wanted.get(name)) for name in roles}
+    choices = choose_each(recording, wanted, config, roles)
     for name, choice in choices.items():
         is_required = choice.role.is_required
         if choice.candidates:

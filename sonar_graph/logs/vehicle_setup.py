@@ -31,7 +31,13 @@ BODY_FRAME = "base_link"
 FrameTree = dict[str, tuple[str, gtsam.Pose3]]
 """Parent and ``parent_T_frame`` of each frame."""
 Values = Mapping[str, Any]
-MOUNTING_FIELDS = {"imu": "mounting", "dvl": "mounting", "depth": "port_m", "sonar": "mounting"}
+MOUNTING_FIELDS = {
+    "imu": "mounting",
+    "dvl": "mounting",
+    "depth": "port_m",
+    "positions": "antenna_m",
+    "sonar": "mounting",
+}
 """Field of each sensor's section that says where the sensor is."""
 
 
@@ -76,6 +82,7 @@ def encode_mountings(calibration: Calibration) -> Bytes:
         "imu": calibration.imu.mounting,
         "dvl": calibration.dvl.mounting,
         "depth": Mounting(translation_m=calibration.depth.port_m),
+        "positions": Mounting(translation_m=calibration.positions.antenna_m),
         "sonar": calibration.sonar.mounting,
     }
     quaternions = Rotation.from_matrix([m.pose().rotation().matrix() for m in mountings.values()]).as_quat()
@@ -137,13 +144,13 @@ def gathered(
 ) -> Calibration:
     """Gather a calibration, field by field: what the user gives, what the record set, ``/tf_static``, and defaults.
 
-    Mountings of ``/tf_static`` are by sensor; of ``depth`` only the translation counts. Fields that together are no
-    calibration are a CalibrationError, which names the user's source.
+    Mountings of ``/tf_static`` are by sensor; of ``depth`` and ``positions`` only the translation counts.
+    Fields that together are no calibration are a CalibrationError, which names the user's source.
     """
     values = Calibration().model_dump()
     for sensor, mounting in mountings.items():
-        is_port = MOUNTING_FIELDS[sensor] == "port_m"
-        values[sensor][MOUNTING_FIELDS[sensor]] = mounting.translation_m if is_port else mounting.model_dump()
+        is_place = MOUNTING_FIELDS[sensor] != "mounting"
+        values[sensor][MOUNTING_FIELDS[sensor]] = mounting.translation_m if is_place else mounting.model_dump()
     if recorded is not None:
         values = _over(values, recorded.model_dump(exclude_unset=True))
     if given is None:

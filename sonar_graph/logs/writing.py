@@ -18,9 +18,31 @@ from sonar_graph.images import SonarFrames
 from sonar_graph.logs.adapters import SAMPLE_TYPES, body_to_ros
 from sonar_graph.logs.cdr import Bytes, Struct, Value, definition, encode, parse_definition
 from sonar_graph.logs.mcap import Outgoing, recording
-from sonar_graph.logs.roles import DETECTIONS, DVL, IMU, LANDMARK_MAP, ODOMETRY, POSE_WITH_COVARIANCE, SONAR_IMAGE, TF
+from sonar_graph.logs.roles import (
+    DETECTIONS,
+    DVL,
+    HEADING,
+    IMU,
+    LANDMARK_MAP,
+    ODOMETRY,
+    POINT,
+    POSE_WITH_COVARIANCE,
+    SONAR_IMAGE,
+    TF,
+)
 from sonar_graph.logs.vehicle_setup import BODY_FRAME, METADATA, encode_mountings
-from sonar_graph.measurements import NO_TRACK, NS_PER_S, Depth, Dvl, Floats, Imu, Ints, LandmarkDetections
+from sonar_graph.measurements import (
+    NO_TRACK,
+    NS_PER_S,
+    Depth,
+    Dvl,
+    Floats,
+    Heading,
+    Imu,
+    Ints,
+    LandmarkDetections,
+    PositionFixes,
+)
 from sonar_graph.sequence import Sequence, require_sequence
 from sonar_graph.states import LandmarkMap, Trajectory
 
@@ -76,10 +98,15 @@ def write_log(path: str | Path, sequence: Sequence, more: Iterable[Outgoing] = (
     messages.append(dvl_messages("/dvl/data", sequence.dvl))
     if sequence.depth is not None:
         messages.append(depth_messages("/depth/pose", sequence.depth))
+    if sequence.heading is not None:
+        messages.append(heading_messages("/heading", sequence.heading))
+    if sequence.positions is not None:
+        messages.append(fix_messages("/fixes/pose", sequence.positions))
     if sequence.detections is not None:
         messages += detection_messages("/sonar/landmarks", sequence.detections)
     if sequence.truth is not None:
-        messages.append(odometry_messages("/ground_truth/odometry", sequence.truth))
+        of_truth = ("odometry", odometry_messages) if sequence.truth.has_orientation else ("point", point_messages)
+        messages.append(of_truth[1](f"/ground_truth/{of_truth[0]}", sequence.truth))
     record = {
         "name": sequence.name,
         "calibration": sequence.calibration.model_dump_json(),
@@ -130,6 +157,22 @@ def depth_messages(topic: str, depth: Depth) -> Outgoing:
     return outgoing(topic, POSE_WITH_COVARIANCE, depth.stamps_ns, values)
 
 
+def heading_messages(topic: str, heading: Heading) -> Outgoing:
+    """``sonar_graph_msgs/Heading``; it keeps every bit of an angle, a quaternion does not."""
+    values = header(heading.stamps_ns, WORLD_FRAME) | {"yaw_rad": heading.yaw_rad, "sigma_rad": heading.sigma_rad}
+    return outgoing(topic, HEADING, heading.stamps_ns, values)
+
+
+def fix_messages(topic: str, fixes: PositionFixes) -> Outgoing:
+    """``PoseWithCovarianceStamped`` of which the position counts, and the upper left of the covariance."""
+    is_unknown = np.asarray(np.isnan(fixes.covariance_m2).any(axis=(1, 2)))
+    covariances = np.zeros((len(fixes), 6, 6))
+    covariances[:, :3, :3] = np.where(is_unknown[:, None, None], 0.0, fixes.covariance_m2)
+    values = header(fixes.stamps_ns, WORLD_FRAME) | fields("pose.pose.position", "xyz", fixes.position_m)
+    values |= {"pose.pose.orientation.w": 1.0, "pose.covariance": covariances.reshape(-1, 36)}
+    return outgoing(topic, POSE_WITH_COVARIANCE, fixes.stamps_ns, values)
+
+
 def detection_messages(topic: str, detections: LandmarkDetections) -> list[Outgoing]:
     """``sonar_graph_msgs/LandmarkDetections``, one a frame; frames with equally many detections share an entry."""
     stamps_ns, first, counts = np.unique(detections.stamps_ns, return_index=True, return_counts=True)
@@ -164,6 +207,12 @@ def odometry_messages(topic: str, trajectory: Trajectory, body_frame: str = BODY
     """``nav_msgs/Odometry`` without a twist."""
     values = header(trajectory.stamps_ns, WORLD_FRAME) | pose_columns(trajectory) | {"child_frame_id": body_frame}
     return outgoing(topic, ODOMETRY, trajectory.stamps_ns, values)
+
+
+def point_messages(topic: str, trajectory: Trajectory) -> Outgoing:
+    """``geometry_msgs/PointStamped``, of a trajectory whose orientations are not known."""
+    values = header(trajectory.stamps_ns, WORLD_FRAME) | fields("point", "xyz", trajectory.positions)
+    return outgoing(topic, POINT, trajectory.stamps_ns, values)
 
 
 def pose_messages(topic: str, trajectory: Trajectory) -> Outgoing:

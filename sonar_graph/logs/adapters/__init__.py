@@ -2,7 +2,8 @@
 
 # fmt: off
 from sonar_graph.logs.adapters.adapter import Adapter, leaf_fields
-from sonar_graph.logs.adapters.drivers import SHIPPED, Z_DOWN_TYPES, Shipped
+from sonar_graph.logs.adapters.aiding_messages import HeadingAdapter, PositionAdapter
+from sonar_graph.logs.adapters.drivers import SHIPPED, TRUTH_WORDS, Z_DOWN_TYPES, Shipped
 from sonar_graph.logs.adapters.dvl_messages import DvlAdapter
 from sonar_graph.logs.adapters.landmark_messages import (
     DetectionArrayAdapter, DetectionListsAdapter, LandmarkMapAdapter, detection_warnings,
@@ -15,8 +16,9 @@ from sonar_graph.logs.adapters.sonar_messages import SAMPLE_TYPES, Refused, Sona
 from sonar_graph.logs.adapters.vehicle_messages import DepthAdapter, ImuAdapter, TruthAdapter, body_to_ros
 
 __all__ = [
-    "Adapter", "DepthAdapter", "DetectionArrayAdapter", "DetectionListsAdapter", "Dropped", "DvlAdapter", "ImuAdapter",
-    "LandmarkMapAdapter", "LogConfig", "MessageTable", "Refused", "SAMPLE_TYPES", "SHIPPED", "Shipped", "SonarAdapter",
-    "TruthAdapter", "Z_DOWN_TYPES", "body_to_ros", "changes_text", "detection_warnings", "leaf_fields", "plain_lines",
-    "read_log_config", "shipped_for", "shipped_like", "table_text",
+    "Adapter", "DepthAdapter", "DetectionArrayAdapter", "DetectionListsAdapter", "Dropped", "DvlAdapter",
+    "HeadingAdapter", "ImuAdapter", "LandmarkMapAdapter", "LogConfig", "MessageTable", "PositionAdapter", "Refused",
+    "SAMPLE_TYPES", "SHIPPED", "Shipped", "SonarAdapter", "TRUTH_WORDS", "TruthAdapter", "Z_DOWN_TYPES", "body_to_ros",
+    "changes_text", "detection_warnings", "leaf_fields", "plain_lines", "read_log_config", "shipped_for",
+    "shipped_like", "table_text",
 ]

@@ -94,6 +94,10 @@ class Adapter(Section):
         known = dict(leaf_fields(definition))
         return [path for path in self.fields() if field_of(path)[0] not in known]
 
+    def refusal(self, topic: Topic) -> str | None:  # noqa: ARG002  # for subclasses
+        """Reason why messages with all fields play no role, which completes "/imu ..."; None: there is none."""
+        return None
+
     def table(self, topic: Topic) -> MessageTable:
         """Messages of a topic with their stamps."""
         return MessageTable(topic, self.stamp, self.stamp_unit_s, self.stamp_offset_s)

@@ -8,6 +8,7 @@ it into `SHIPPED` (docs/design/0004-logs.md).
 from dataclasses import dataclass
 
 from sonar_graph.logs.adapters.adapter import Adapter, CovarianceFields
+from sonar_graph.logs.adapters.aiding_messages import GeodeticFields, HeadingAdapter, PositionAdapter
 from sonar_graph.logs.adapters.dvl_messages import DvlAdapter
 from sonar_graph.logs.adapters.landmark_messages import DetectionArrayAdapter, DetectionListsAdapter, LandmarkMapAdapter
 from sonar_graph.logs.adapters.sonar_messages import SonarAdapter
@@ -16,6 +17,8 @@ from sonar_graph.logs.adapters.vehicle_messages import DepthAdapter, ImuAdapter,
 TRUTH_WORDS = ("truth",)
 _DVL_WORDS = ("dvl", "doppler")
 _DEPTH_WORDS = ("depth",)
+_HEADING_WORDS = ("heading", "compass", "ahrs")
+_FIX_WORDS = ("fix", "gps", "gnss", "usbl")
 _LANDMARK_WORDS = ("landmark", "sonar")
 Z_DOWN_TYPES = frozenset({"marine_acoustic_msgs/msg/Dvl"})
 """Types whose definition has z downwards, which not all drivers follow."""
@@ -59,6 +62,35 @@ IMU = ImuAdapter(
     linear_acceleration=_xyz("linear_acceleration"),
     linear_acceleration_status="linear_acceleration_covariance[0]",
 )
+ORIENTATION_OF_IMU = HeadingAdapter(
+    type="sensor_msgs/msg/Imu",
+    orientation=(*_xyz("orientation"), "orientation.w"),
+    variance=CovarianceFields(fields=("orientation_covariance[8]",)),
+    needs_variance=True,
+    status="orientation_covariance[0]",
+)
+HEADING = HeadingAdapter(
+    type="sonar_graph_msgs/msg/Heading",
+    yaw="yaw_rad",
+    variance=CovarianceFields(fields=("sigma_rad",), meaning="standard deviation"),
+)
+HEADING_QUATERNION = HeadingAdapter(
+    type="geometry_msgs/msg/QuaternionStamped", orientation=(*_xyz("quaternion"), "quaternion.w")
+)
+SATELLITE_FIELDS = GeodeticFields(latitude="latitude", longitude="longitude", height="altitude", status="status.status")
+SATELLITE_FIX = PositionAdapter(
+    type="sensor_msgs/msg/NavSatFix",
+    geodetic=SATELLITE_FIELDS,
+    covariance=CovarianceFields(fields=("position_covariance",)),
+    covariance_type="position_covariance_type",
+)
+FIX_POSE = PositionAdapter(
+    type="geometry_msgs/msg/PoseWithCovarianceStamped",
+    position=_xyz("pose.pose.position"),
+    covariance=CovarianceFields(fields=("pose.covariance",)),
+    frame_id_field=None,
+)
+FIX_POINT = PositionAdapter(type="geometry_msgs/msg/PointStamped", position=_xyz("point"), frame_id_field=None)
 MARINE_DVL = DvlAdapter(
     type="marine_acoustic_msgs/msg/Dvl",
     velocity=_xyz("velocity"),
@@ -97,6 +129,8 @@ HEIGHT_OF_POSE_WITH_COVARIANCE = DepthAdapter(
 ODOMETRY_TRUTH = _poses("nav_msgs/msg/Odometry", "pose.pose", "pose.covariance")
 POSE_TRUTH = _poses("geometry_msgs/msg/PoseStamped", "pose", None)
 POSE_WITH_COVARIANCE_TRUTH = _poses("geometry_msgs/msg/PoseWithCovarianceStamped", "pose.pose", "pose.covariance")
+POINT_TRUTH = TruthAdapter(type="geometry_msgs/msg/PointStamped", position=_xyz("point"))
+SATELLITE_TRUTH = TruthAdapter(type="sensor_msgs/msg/NavSatFix", geodetic=SATELLITE_FIELDS)
 PROJECTED_SONAR_IMAGE = SonarAdapter(
     type="marine_acoustic_msgs/msg/ProjectedSonarImage",
     data="image.data",
@@ -131,6 +165,16 @@ SHIPPED: dict[str, tuple[Shipped, ...]] = {
         Shipped(HEIGHT_OF_POSE_WITH_COVARIANCE, _DEPTH_WORDS),
         Shipped(HEIGHT_OF_POSE, _DEPTH_WORDS),
     ),
+    "heading": (
+        Shipped(HEADING),
+        Shipped(HEADING_QUATERNION, _HEADING_WORDS),
+        Shipped(ORIENTATION_OF_IMU, is_general=True),
+    ),
+    "positions": (
+        Shipped(SATELLITE_FIX),
+        Shipped(FIX_POSE, _FIX_WORDS, is_general=True),
+        Shipped(FIX_POINT, _FIX_WORDS, is_general=True),
+    ),
     "detections": (
         Shipped(DetectionListsAdapter(type="sonar_graph_msgs/msg/LandmarkDetections")),
         Shipped(DetectionArrayAdapter(type="vision_msgs/msg/Detection3DArray"), _LANDMARK_WORDS, is_general=True),
@@ -139,6 +183,8 @@ SHIPPED: dict[str, tuple[Shipped, ...]] = {
         Shipped(ODOMETRY_TRUTH, TRUTH_WORDS),
         Shipped(POSE_WITH_COVARIANCE_TRUTH, TRUTH_WORDS, is_general=True),
         Shipped(POSE_TRUTH, TRUTH_WORDS, is_general=True),
+        Shipped(POINT_TRUTH, TRUTH_WORDS, is_general=True),
+        Shipped(SATELLITE_TRUTH, TRUTH_WORDS, is_general=True),
     ),
     "true_landmarks": (Shipped(LandmarkMapAdapter(type="sonar_graph_msgs/msg/LandmarkMap"), TRUTH_WORDS),),
     "sonar": (Shipped(PROJECTED_SONAR_IMAGE), Shipped(OCULUS_PING)),

@@ -23,6 +23,7 @@ from pydantic import BaseModel, ValidationError
 
 from sonar_graph.errors import LogError
 from sonar_graph.logs.adapters.adapter import Adapter, leaf_fields
+from sonar_graph.logs.adapters.aiding_messages import HeadingAdapter, PositionAdapter
 from sonar_graph.logs.adapters.drivers import SHIPPED
 from sonar_graph.logs.adapters.dvl_messages import DvlAdapter
 from sonar_graph.logs.adapters.landmark_messages import DetectionArrayAdapter, LandmarkMapAdapter
@@ -36,6 +37,8 @@ ADAPTERS: dict[str, type[Adapter]] = {
     "imu": ImuAdapter,
     "dvl": DvlAdapter,
     "depth": DepthAdapter,
+    "heading": HeadingAdapter,
+    "positions": PositionAdapter,
     "detections": DetectionArrayAdapter,
     "truth": TruthAdapter,
     "true_landmarks": LandmarkMapAdapter,

@@ -18,12 +18,15 @@ from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation as SpatialRotation
 
 from sonar_graph.logs.adapters.adapter import Adapter, CovarianceFields, Scale, axes_matrix, field_paths, turn
+from sonar_graph.logs.adapters.aiding_messages import ENU_R_NED, GeodeticFields
 from sonar_graph.logs.adapters.message_table import NOT_FINITE, Dropped, MessageTable, fit_rows, not_finite
+from sonar_graph.logs.geodesy import Origin
 from sonar_graph.measurements import Depth, Floats, Imu
 from sonar_graph.states import Trajectory
 
 Paths = tuple[str, str, str]
-_ENU_R_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+LEAST_MOVE_M = 1.0
+"""A vehicle that moved less may not have turned."""
 
 
 class ImuAdapter(Adapter):
@@ -145,10 +148,12 @@ class TruthAdapter(Adapter):
     """
 
     frame_id_field: str | None = None
-    position: Paths
+    position: Paths | None = None
     """Fields of x, y, z in the world."""
-    orientation: tuple[str, str, str, str]
-    """Fields of the quaternion's x, y, z, w."""
+    geodetic: GeodeticFields | None = None
+    """Fields of a position on the Earth instead."""
+    orientation: tuple[str, str, str, str] | None = None
+    """Fields of the quaternion's x, y, z, w; false: only positions are true, and no heading is scored."""
     covariance: str | None = None
     """Array field of 36: position, then rotation, along the world's axes, as ROS has it."""
     covariance_meaning: Literal["variance", "standard deviation"] = "variance"
@@ -156,21 +161,40 @@ class TruthAdapter(Adapter):
     world: Literal["enu", "ned"] = "enu"
     """"enu" (any world with z up), or "ned"."""
 
+    @model_validator(mode="after")
+    def _has_one_source(self) -> TruthAdapter:
+        if (self.geodetic is None) == (self.position is None):
+            raise ValueError("give either position = [x, y, z] or geodetic = {latitude = ..., longitude = ...}")
+        return self
+
     def fields(self) -> Iterator[str]:
         """Paths that a message must have."""
-        return field_paths(self.position, self.orientation, self.covariance)
+        geodetic = self.geodetic.paths() if self.geodetic else None
+        return field_paths(self.position, geodetic, self.orientation, self.covariance)
 
-    def read(self, table: MessageTable) -> tuple[Trajectory | None, Dropped]:
-        """Poses with covariances; NaN: unknown."""
-        positions, quaternions = table.beside(self.position), table.beside(self.orientation)
+    def read(self, table: MessageTable, origin: Origin | None = None) -> tuple[Trajectory | None, Dropped]:
+        """Poses with covariances, NaN: unknown; ``origin`` in degrees and metres, of positions on the Earth."""
+        faults: dict[str, np.ndarray] = {}
+        if self.geodetic is not None:
+            positions, is_fix, _ = self.geodetic.positions(table, origin)
+            faults["without a fix"] = ~is_fix
+        else:
+            positions = table.beside(self.position or ())
+            faults[NOT_FINITE] = not_finite(positions)
+        if self.orientation is None:
+            rows, dropped = fit_rows(table.stamps_ns, faults, unique=True)
+            positions = positions[rows] @ ENU_R_NED.T if self.world == "ned" and self.position else positions[rows]
+            return Trajectory.of_positions(table.stamps_ns[rows], positions) if rows.size else None, dropped
+        quaternions = table.beside(self.orientation)
         lengths = np.linalg.norm(quaternions, axis=1)
-        faults = {NOT_FINITE: not_finite(positions, quaternions), "without an orientation": lengths < 0.5}
+        faults[NOT_FINITE] = not_finite(positions, quaternions)
+        faults["without an orientation"] = lengths < 0.5
         rows, dropped = fit_rows(table.stamps_ns, faults, unique=True)
         if not rows.size:
             return None, dropped
         scale = np.where(np.abs(lengths - 1) > 1e-6, lengths, 1.0)  # unit quaternions keep every bit
         positions, quaternions = positions[rows], (quaternions / scale[:, None])[rows]
-        enu_R_world = _ENU_R_NED if self.world == "ned" else np.eye(3)
+        enu_R_world = ENU_R_NED if self.world == "ned" else np.eye(3)
         if self.world != "enu" or self.rotation != "flu":
             matrices = SpatialRotation.from_quat(quaternions).as_matrix()
             turned = SpatialRotation.from_matrix(enu_R_world @ matrices @ axes_matrix(self.rotation).T)
@@ -189,6 +213,18 @@ class TruthAdapter(Adapter):
             covariances = W @ covariances @ W.T
         covariances = ros_to_body(covariances, truth.matrices)
         return Trajectory(truth.stamps_ns, truth.positions, truth.quaternions_xyzw, covariances), dropped
+
+    def warnings(self, table: MessageTable) -> Iterator[str]:
+        """Warning about an orientation that never changes while the vehicle moves."""
+        if self.orientation is None or self.position is None or len(table) < 2:
+            return
+        quaternions, positions = table.beside(self.orientation), table.beside(self.position)
+        moved_m = float(np.linalg.norm(np.ptp(positions, axis=0)))
+        if np.isfinite(moved_m) and moved_m > LEAST_MOVE_M and not (quaternions != quaternions[0]).any():
+            yield (
+                f"its orientation is the same in all {len(table)} messages, although it moves by {moved_m:.3g} m: if "
+                "that is none, `orientation = false` under [truth] in the log configuration; no heading is then scored"
+            )
 
 
 def body_to_ros(covariances: Floats, rotations: Floats) -> Floats:

@@ -24,6 +24,7 @@ DEFINITIONS: dict[str, str] = {
     "geometry_msgs/Point": _XYZ,
     "geometry_msgs/Quaternion": f"{_XYZ}\nfloat64 w",
     "geometry_msgs/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation",
+    "geometry_msgs/PointStamped": "std_msgs/Header header\ngeometry_msgs/Point point",
     "geometry_msgs/PoseStamped": "std_msgs/Header header\ngeometry_msgs/Pose pose",
     "geometry_msgs/PoseWithCovariance": "geometry_msgs/Pose pose\nfloat64[36] covariance",
     "geometry_msgs/PoseWithCovarianceStamped": "std_msgs/Header header\ngeometry_msgs/PoseWithCovariance pose",
@@ -141,6 +142,11 @@ float64[] covariance           # 4 a detection, row-major over (range, azimuth);
 int64[] candidate_ids          # k a detection, row-major; -1 fills unused places
 float64[] id_probability       # k a detection; what is missing to 1 is "no known landmark"
 int64[] track                  # the watch of one object that each belongs to, -1: none; empty: none at all""",
+    "sonar_graph_msgs/Heading": """\
+# Yaw of the body in the world, x east where it has a compass.
+std_msgs/Header header
+float64 yaw_rad                # Rz(yaw) Ry(pitch) Rx(roll), positive to the left
+float64 sigma_rad              # standard deviation; NaN: unknown""",
     "sonar_graph_msgs/LandmarkMap": """\
 # Landmarks by identity, in the frame of the header.
 std_msgs/Header header

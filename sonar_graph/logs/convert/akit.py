@@ -4,11 +4,6 @@ Cohen, Klein, "Adaptive Kalman-informed transformer", Engineering Applications o
 ``TrajectoryN`` of ``IMU_``, ``DVL_`` and ``GT_trajectoryN.csv``: 400 s at 100, 1 and 1 Hz, body axes forward, right,
 down and a world of north, east, down. ``docs/theory/datasets.md`` derives from the data what the files do not state:
 the sign of the IMU's y axis, the times of the rows, the lever arms, and that the gyros measure the Earth's rotation.
-
-Latitude φ, longitude λ and altitude h become metres by Earth-centred coordinates on the WGS-84 ellipsoid::
-
-    N = a / sqrt(1 - e² sin²φ)
-    X = (N + h) cos φ cos λ,   Y = (N + h) cos φ sin λ,   Z = (N (1 - e²) + h) sin φ
 """
 
 from pathlib import Path
@@ -19,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting, Start
 from sonar_graph.errors import DatasetError
 from sonar_graph.logs.convert.text_tables import numbered_run, read_table
+from sonar_graph.logs.geodesy import east_north_up
 from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import Trajectory
@@ -43,30 +39,6 @@ FILES = "TrajectoryN/{IMU,DVL,GT}_trajectoryN.csv"
 IMU_COLUMNS = ("Time", "ACC X", "ACC Y", "ACC Z", "GYRO X", "GYRO Y", "GYRO Z")
 DVL_COLUMNS = ("Time", "DVL X", "DVL Y", "DVL Z")
 REFERENCE_COLUMNS = ("Time", "Longitude", "Latitude", "Altitude", "V North", "V East", "V Down", "Roll", "Pitch", "Yaw")
-SEMI_MAJOR_AXIS_M = 6378137.0
-FLATTENING = 1.0 / 298.257223563
-ECCENTRICITY_SQUARED = FLATTENING * (2.0 - FLATTENING)
-
-
-def earth_centred(latitude_rad: Floats, longitude_rad: Floats, altitude_m: Floats) -> Floats:
-    """Earth-centred, Earth-fixed coordinates, shape (n, 3), metres."""
-    sin, cos = np.sin(latitude_rad), np.cos(latitude_rad)
-    N = SEMI_MAJOR_AXIS_M / np.sqrt(1.0 - ECCENTRICITY_SQUARED * sin**2)
-    across = (N + altitude_m) * cos
-    along = (N * (1.0 - ECCENTRICITY_SQUARED) + altitude_m) * sin
-    return np.column_stack([across * np.cos(longitude_rad), across * np.sin(longitude_rad), along])
-
-
-def east_north_up(latitude_rad: Floats, longitude_rad: Floats, altitude_m: Floats) -> Floats:
-    """Positions east, north, up of the first row at altitude 0, shape (n, 3), metres."""
-    origin = earth_centred(latitude_rad[:1], longitude_rad[:1], np.zeros(1))
-    offsets = earth_centred(latitude_rad, longitude_rad, altitude_m) - origin
-    first_latitude_rad, first_longitude_rad = float(latitude_rad[0]), float(longitude_rad[0])
-    sin_lat, cos_lat = np.sin(first_latitude_rad), np.cos(first_latitude_rad)
-    sin_lon, cos_lon = np.sin(first_longitude_rad), np.cos(first_longitude_rad)
-    east, north = [-sin_lon, cos_lon, 0.0], [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat]
-    enu_R_earth = np.array([east, north, [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat]])
-    return offsets @ enu_R_earth.T
 
 
 def enu_R_flu(roll_rad: Floats, pitch_rad: Floats, yaw_rad: Floats) -> Rotation:
@@ -113,7 +85,7 @@ def read_akit(dataset_dir: Path, trajectory: int) -> Sequence:
     dvl = Dvl(DVL_DELAY_NS + dvl_ns, dvl_rows[:, 1:] * FLU_OF_FRD, np.full((len(dvl_ns), 3, 3), np.nan))
     longitude, latitude, altitude = reference_rows[:, 1:4].T
     quaternions = enu_R_flu(*reference_rows[:, 7:10].T).as_quat()
-    positions = east_north_up(latitude, longitude, altitude)
+    positions = east_north_up(latitude, longitude, altitude, (float(latitude[0]), float(longitude[0]), 0.0))
     truth = Trajectory.without_covariances(reference_ns, positions, quaternions)
     start_ns = int(max(imu.stamps_ns[0], dvl.stamps_ns[0]))
     if truth.stamps_ns[-1] < start_ns:

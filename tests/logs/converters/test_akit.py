@@ -6,7 +6,8 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
 from sonar_graph.calibration import Mounting
-from sonar_graph.logs.convert.akit import earth_centred, east_north_up, enu_R_flu, read_akit
+from sonar_graph.logs.convert.akit import enu_R_flu, read_akit
+from sonar_graph.logs.geodesy import earth_centred, east_north_up
 from sonar_graph.navigation import Odometry
 
 LATITUDE = 0.5733
@@ -71,8 +72,9 @@ def test_small_offsets_are_the_radii_of_curvature_times_the_angles(latitude, lon
     e2, a, d = 6.69437999014e-3, 6378137.0, 1e-6
     meridian = a * (1 - e2) / (1 - e2 * np.sin(latitude) ** 2) ** 1.5
     vertical = a / np.sqrt(1 - e2 * np.sin(latitude) ** 2)
+    heights = np.array([-5.0, -5.0, -5.0, -2.0])
     enu = east_north_up(
-        latitude + np.array([0, d, 0, 0]), longitude + np.array([0, 0, d, 0]), np.array([-5.0, -5.0, -5.0, -2.0])
+        latitude + np.array([0, d, 0, 0]), longitude + np.array([0, 0, d, 0]), heights, (latitude, longitude, 0.0)
     )
     assert np.allclose(enu[1] - enu[0], [0, (meridian - 5) * d, 0], rtol=0, atol=1e-4)
     assert np.allclose(enu[2] - enu[0], [(vertical - 5) * np.cos(latitude) * d, 0, 0], rtol=0, atol=1e-4)

@@ -1,0 +1,231 @@
+"""Adapters for heading and for position fixes: AHRS, compass, satellite receiver, acoustic positioning.
+
+A heading is the yaw of ``world_R_body = world_R_driver driver_R_body`` (Rz Ry Rx). A bearing β clockwise from north is
+a yaw of ``90° - β`` in a world with x east. Fixes in latitude and longitude become metres east, north and up of an
+origin (`sonar_graph.logs.geodesy`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+from scipy.spatial.transform import Rotation as SpatialRotation
+
+from sonar_graph.calibration import Section
+from sonar_graph.logs.adapters.adapter import Adapter, CovarianceFields, Scale, axes_matrix, field_paths
+from sonar_graph.logs.adapters.message_table import NOT_FINITE, Dropped, MessageTable, fit_rows, not_finite
+from sonar_graph.logs.geodesy import Origin, east_north_up
+from sonar_graph.logs.mcap import Topic
+from sonar_graph.measurements import UNMEASURED_M2, Floats, Heading, PositionFixes
+
+ENU_R_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+STEEPEST_RAD = np.radians(80.0)
+"""Pitch above which roll and yaw are hardly told apart."""
+_WHOLE_CIRCLE = 2 * np.pi + 0.1
+
+
+class HeadingAdapter(Adapter):
+    """Yaw of the body, from an orientation or from one angle."""
+
+    orientation: tuple[str, str, str, str] | None = None
+    """Fields of the quaternion's x, y, z, w: the sensor in the world."""
+    yaw: str | None = None
+    """Field with an angle instead: of the body, positive to the left from the world's x."""
+    scale: Scale = 1.0
+    """Turns the angle into rad; 0.017453292519943295 from degrees."""
+    world: Literal["enu", "ned"] = "enu"
+    """"enu" (any world with z up), or "ned": an angle then is a bearing, clockwise from north."""
+    yaw_offset_rad: float = Field(0.0, allow_inf_nan=False)
+    """Added to every yaw: minus the declination (positive to the east) where north is magnetic."""
+    variance: CovarianceFields | None = None
+    """One field with the yaw's variance, rad²; without it, or where not above 0, the calibration's noise holds."""
+    needs_variance: bool = False
+    """Messages that state no variance are no measurements: drivers fill an orientation that is none."""
+    status: str | None = None
+    """Field that is -1 where the orientation was not measured."""
+
+    @model_validator(mode="after")
+    def _has_one_source(self) -> HeadingAdapter:
+        if (self.orientation is None) == (self.yaw is None):
+            raise ValueError("give either orientation = [x, y, z, w] or yaw")
+        return self
+
+    def fields(self) -> Iterator[str]:
+        """Paths that a message must have."""
+        variance = self.variance.fields if self.variance else None
+        return field_paths(self.orientation, self.yaw, variance, self.status)
+
+    def refusal(self, topic: Topic) -> str | None:
+        """Reason why no message has a heading, which completes "/imu ..."."""
+        if not len(topic) or self.is_measured(self.table(topic)).any():
+            return None
+        field = self.variance.fields[0] if self.variance and self.needs_variance else self.status
+        return (
+            f"says of no orientation that it is measured ({field}); to use it all the same: needs_variance = false and "
+            "status = false under [heading] in a log configuration"
+        )
+
+    def is_measured(self, table: MessageTable) -> NDArray[np.bool_]:
+        """Mask of messages that say that yaw is measured, shape (n,)."""
+        measured = np.ones(len(table), bool) if self.status is None else table.column(self.status) != -1
+        if self.variance is not None and self.needs_variance:
+            measured &= np.isfinite(self.variance.read_variance(table))
+        return measured
+
+    def read(self, table: MessageTable, body_R_sensor: Floats) -> tuple[Heading | None, Dropped]:
+        """Yaw of the body with its sigma; NaN: unknown. ``body_R_sensor``, shape (3, 3), counts for an orientation."""
+        faults = {"whose orientation is no measurement": ~self.is_measured(table)}
+        if self.orientation is not None:
+            quaternions = table.beside(self.orientation).astype(float)
+            lengths = np.linalg.norm(quaternions, axis=1)
+            is_rotation = np.isfinite(lengths) & (lengths > 0.5)
+            sensor = SpatialRotation.from_quat(np.where(is_rotation[:, None], quaternions, [0.0, 0.0, 0.0, 1.0]))
+            enu_R_world = ENU_R_NED if self.world == "ned" else np.eye(3)
+            R = enu_R_world @ sensor.as_matrix() @ (body_R_sensor @ axes_matrix(self.rotation)).T
+            yaw_rad = np.arctan2(R[:, 1, 0], R[:, 0, 0])
+            faults |= {
+                "without an orientation": ~is_rotation,
+                "with the nose too steep for a heading": np.abs(R[:, 2, 0]) > np.sin(STEEPEST_RAD),
+            }
+        else:
+            yaw_rad = table.column(str(self.yaw)) * self.scale
+            yaw_rad = np.pi / 2 - yaw_rad if self.world == "ned" else yaw_rad
+            faults[NOT_FINITE] = not_finite(yaw_rad)
+        variance = self.variance.read_variance(table) if self.variance else np.full(len(table), np.nan)
+        rows, dropped = fit_rows(table.stamps_ns, faults, unique=True)
+        if not rows.size:
+            return None, dropped
+        yaw_rad = yaw_rad[rows] + self.yaw_offset_rad if self.yaw_offset_rad else yaw_rad[rows]
+        return Heading(table.stamps_ns[rows], yaw_rad, np.sqrt(variance[rows])), dropped
+
+    def warnings(self, table: MessageTable) -> Iterator[str]:
+        """Warning about an angle that looks like degrees."""
+        if self.yaw is not None:
+            angles = np.abs(table.column(self.yaw) * self.scale)
+            largest = float(np.max(angles, initial=0.0, where=np.isfinite(angles)))
+            if largest > _WHOLE_CIRCLE:
+                yield (
+                    f"{self.yaw} is up to {largest:.4g}, more than a whole circle in rad: degrees? "
+                    f"`scale = {self.scale * np.pi / 180:.6g}` under [heading] in the log configuration"
+                )
+
+
+class GeodeticFields(Section):
+    """Fields of a position on the Earth, and the origin of the world."""
+
+    latitude: str
+    """Degrees, north."""
+    longitude: str
+    """Degrees, east."""
+    height: str | None = None
+    """Metres above the ellipsoid, or any other level; none, or not finite: not measured."""
+    status: str | None = None
+    """Field that is negative where there is no fix."""
+    origin_deg_m: tuple[float, float, float] | None = None
+    """Latitude, longitude (degrees) and height (m) of the world's origin; none: those of the first fix in the log."""
+
+    def paths(self) -> Iterator[str]:
+        """Paths that a message must have."""
+        return field_paths(self.latitude, self.longitude, self.height, self.status)
+
+    def read(self, table: MessageTable) -> tuple[Floats, NDArray[np.bool_]]:
+        """Latitude, longitude in degrees and height in metres, shape (n, 3), and a mask of fixes, shape (n,).
+
+        Drivers without a fix send latitude and longitude 0; a height that is not measured is NaN.
+        """
+        place = np.column_stack([table.column(self.latitude), table.column(self.longitude)]).astype(float)
+        height = table.column(self.height).astype(float) if self.height else np.full(len(table), np.nan)
+        is_fix = np.isfinite(place).all(axis=1) & place.any(axis=1) & (np.abs(place) <= [90.0, 360.0]).all(axis=1)
+        if self.status is not None:
+            is_fix &= table.column(self.status) >= 0
+        return np.column_stack([place, np.where(np.isfinite(height), height, np.nan)]), is_fix
+
+    def first_fix(self, table: MessageTable) -> Origin | None:
+        """Latitude and longitude in degrees, and height in metres, of the first fix by its stamp; None without one."""
+        places, is_fix = self.read(table)
+        rows = np.flatnonzero(is_fix)
+        if not rows.size:
+            return None
+        latitude, longitude, height = places[rows[np.argmin(table.stamps_ns[rows])]].tolist()
+        heights = places[is_fix & np.isfinite(places[:, 2]), 2]
+        return latitude, longitude, height if np.isfinite(height) else float(heights[0]) if heights.size else 0.0
+
+    def positions(self, table: MessageTable, origin: Origin | None) -> tuple[Floats, np.ndarray, NDArray[np.bool_]]:
+        """Metres east, north, up of an origin in degrees and metres, shape (n, 3), and masks of fixes and of heights.
+
+        A height that is not measured is 0.
+        """
+        places, is_fix = self.read(table)
+        latitude_deg, longitude_deg, height_m = origin or (0.0, 0.0, 0.0)
+        has_height = np.isfinite(places[:, 2])
+        heights_m = np.where(has_height, places[:, 2], height_m)
+        degrees = np.where(is_fix[:, None], places[:, :2], [latitude_deg, longitude_deg])
+        origin_rad = float(np.radians(latitude_deg)), float(np.radians(longitude_deg)), height_m
+        metres = east_north_up(np.radians(degrees[:, 0]), np.radians(degrees[:, 1]), heights_m, origin_rad)
+        return np.where(has_height[:, None], metres, metres * [1.0, 1.0, 0.0]), is_fix, has_height
+
+
+class PositionAdapter(Adapter):
+    """Fixes of an antenna or transponder, in latitude and longitude or in metres of the world."""
+
+    geodetic: GeodeticFields | None = None
+    """Fields of a position on the Earth."""
+    position: tuple[str, str, str] | None = None
+    """Fields of x, y, z in the world instead, metres."""
+    world: Literal["enu", "ned"] = "enu"
+    """"enu" (any world with z up), or "ned"; of `position`."""
+    covariance: CovarianceFields | None = None
+    """Along the world's axes; without it the calibration's noise holds."""
+    covariance_type: str | None = None
+    """Field that is 0 where the covariance is unknown."""
+
+    @model_validator(mode="after")
+    def _has_one_source(self) -> PositionAdapter:
+        if (self.geodetic is None) == (self.position is None):
+            raise ValueError("give either position = [x, y, z] or geodetic = {latitude = ..., longitude = ...}")
+        return self
+
+    def fields(self) -> Iterator[str]:
+        """Paths that a message must have."""
+        geodetic = self.geodetic.paths() if self.geodetic else None
+        covariance = self.covariance.fields if self.covariance else None
+        return field_paths(geodetic, self.position, covariance, self.covariance_type)
+
+    def read(
+        self, table: MessageTable, origin: Origin | None, sigma_m: tuple[float, float, float]
+    ) -> tuple[PositionFixes | None, Dropped]:
+        """Fixes with covariances, NaN: unknown.
+
+        ``origin``, in degrees and metres, is for positions on the Earth, the calibration's ``sigma_m`` for fixes
+        without height and covariance.
+        """
+        faults: dict[str, NDArray[np.bool_]] = {}
+        has_height = np.ones(len(table), bool)
+        if self.geodetic is not None:
+            positions, is_fix, has_height = self.geodetic.positions(table, origin)
+            faults["without a fix"] = ~is_fix
+        else:
+            positions = table.beside(self.position or ()).astype(float)
+            faults[NOT_FINITE] = not_finite(positions)
+        covariances = np.full((len(table), 3, 3), np.nan)
+        if self.covariance is not None:
+            covariances, faults["with a covariance that says invalid"] = self.covariance.read(table)
+        if self.covariance_type is not None:
+            covariances = np.where((table.column(self.covariance_type) == 0)[:, None, None], np.nan, covariances)
+        if self.position is not None and self.world == "ned":
+            positions, covariances = positions @ ENU_R_NED.T, ENU_R_NED @ covariances @ ENU_R_NED.T
+        flat = np.where(np.isnan(covariances), np.diag(np.square(sigma_m)), covariances)
+        flat[:, 2, :], flat[:, :, 2], flat[:, 2, 2] = 0.0, 0.0, UNMEASURED_M2
+        covariances = np.where(has_height[:, None, None], covariances, flat)
+        rows, dropped = fit_rows(table.stamps_ns, faults, unique=True)
+        fixes = PositionFixes(table.stamps_ns[rows], positions[rows], covariances[rows]) if rows.size else None
+        return fixes, dropped
+
+    def warnings(self, table: MessageTable) -> Iterator[str]:
+        """Warning about matrices that are no covariances."""
+        if self.covariance is not None:
+            yield from self.covariance.warnings(table)
