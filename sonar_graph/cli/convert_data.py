@@ -90,6 +90,14 @@ def akit(
     _convert(lambda: read_akit(dataset, trajectory), dataset, output, overwrite)
 
 
+@datasets.command(epilog=examples("sonar-graph convert stpere StPereDataset -o stpere.mcap"))
+def stpere(dataset: DatasetFolder, output: OutputLog, overwrite: Overwrite = False) -> None:
+    """St. Pere: an underwater vehicle in a marina, cheap IMU, compass and DVL, satellite positions as truth."""
+    from sonar_graph.logs.convert import read_stpere
+
+    _convert(lambda: read_stpere(dataset), dataset, output, overwrite)
+
+
 @datasets.command(
     epilog=examples(
         "sonar-graph convert rosbag dive.bag -o dive.mcap", "sonar-graph convert rosbag ros2_bag_folder -o dive.mcap"

@@ -8,8 +8,9 @@ from sonar_graph.logs.convert.oculus import convert_oculus
 from sonar_graph.logs.convert.rosbag import BagConversion, convert_rosbag
 from sonar_graph.logs.convert.sonar_file import SonarConversion
 from sonar_graph.logs.convert.step_files import read_dlr, read_victoria_park
+from sonar_graph.logs.convert.stpere import read_stpere
 
 __all__ = [
     "BagConversion", "SonarConversion", "convert_aris", "convert_didson", "convert_oculus", "convert_rosbag",
-    "read_akit", "read_dlr", "read_mrclam", "read_victoria_park",
+    "read_akit", "read_dlr", "read_mrclam", "read_stpere", "read_victoria_park",
 ]

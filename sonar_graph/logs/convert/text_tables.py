@@ -28,26 +28,38 @@ class NumberTable:
 
 
 def read_table(
-    path: Path, columns: tuple[str, ...], *, delimiter: str | None = None, header_lines: int = 0
+    path: Path,
+    columns: tuple[str, ...],
+    *,
+    delimiter: str | None = None,
+    header_lines: int = 0,
+    comment: str = "#",
+    encoding: str = "utf-8",
 ) -> NumberTable:
     """Read a table whose every field is a finite number.
 
-    Blank lines and lines that begin with ``#`` are skipped, and so many ``header_lines``; ``columns`` are for the error
-    and for their number; ``delimiter``: None is white space.
+    Blank lines and lines that begin with ``comment`` are skipped, and so many ``header_lines``; ``columns`` are for the
+    error and for their number; ``delimiter``: None is white space.
 
     Raises `DatasetError` when the file is missing, has no row, or a row does not hold as many numbers as there are
     columns.
     """
     first: list[str] = []
     rows: list[list[float]] = []
-    for number, fields in read_lines(path, f"rows of {', '.join(columns)}", delimiter, header_lines):
+    expected = f"rows of {', '.join(columns)}"
+    for number, fields in read_lines(path, expected, delimiter, header_lines, comment, encoding):
         rows.append(numbers(path, number, fields, columns))
         first.append(fields[0])
     return NumberTable(path, first, np.array(rows))
 
 
 def read_lines(
-    path: Path, expected: str, delimiter: str | None = None, header_lines: int = 0
+    path: Path,
+    expected: str,
+    delimiter: str | None = None,
+    header_lines: int = 0,
+    comment: str = "#",
+    encoding: str = "utf-8",
 ) -> Iterator[tuple[int, list[str]]]:
     """Line number (from 1) and fields of every line with content.
 
@@ -55,14 +67,14 @@ def read_lines(
     there.
     """
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding).splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(
             f"{path}: cannot be read as text ({getattr(error, 'strerror', None) or error}); expected {expected}"
         ) from error
     empty = True
     for number, line in enumerate(lines[header_lines:], start=header_lines + 1):
-        if line.strip() and not line.lstrip().startswith("#"):
+        if line.strip() and not line.lstrip().startswith(comment):
             empty = False
             yield number, line.split(delimiter)
     if empty:
