@@ -50,7 +50,7 @@ class Sequence:
     depth: Depth | None = None
     detections: LandmarkDetections | None = None
     truth: Trajectory | None = None
-    """Reference poses of the body; `notes` says where they come from."""
+    """Reference poses of the body, or its positions only; `notes` says where they come from."""
     true_landmarks: LandmarkMap | None = None
     heading: Heading | None = None
     positions: PositionFixes | None = None
@@ -66,6 +66,11 @@ class Sequence:
         """Measurements that there are, by their names in `Measurements`."""
         names = ("imu", "dvl", "depth", "detections", "heading", "positions")
         return {name: block for name in names if (block := getattr(self, name)) is not None}
+
+    @property
+    def true_poses(self) -> Trajectory | None:
+        """The truth, where it has orientations and not only positions."""
+        return self.truth if self.truth is not None and self.truth.has_orientation else None
 
     @property
     def start_ns(self) -> int:

@@ -189,10 +189,11 @@ def surest_bias(match: DvlMatch, tilt: StartTilt) -> tuple[Estimates3D, tuple[st
 def reference_findings(right: Sequence, config: LogConfig, tilt: StartTilt) -> Iterator[Finding]:
     """Time offset and first headings of the reference, and the start; its line has the heading of the reference."""
     start = right.calibration.start
-    if right.truth is None:
+    reference = right.true_poses
+    if reference is None:
         yield from tilt_findings(tilt, start, start.rpy_rad[2])
         return
-    found = match_reference_to_imu(right.imu, right.truth, right.calibration)
+    found = match_reference_to_imu(right.imu, reference, right.calibration)
     row, offset = _offset("reference against IMU", found.offset, right.imu, "truth", config)
     yield row
     jump = in_degrees(found.start_heading)
@@ -200,7 +201,7 @@ def reference_findings(right: Sequence, config: LogConfig, tilt: StartTilt) -> I
     advice = "the reference begins with a wrong heading: leave its beginning out with `--start`" if acts else NO_NEED
     yield Finding("first headings of the reference: error", jump, "°", advice, acts)
     is_compared = offset.is_known and start != Start()
-    heading = find_start_heading(right, right.truth, offset) if is_compared else None
+    heading = find_start_heading(right, reference, offset) if is_compared else None
     yield from tilt_findings(tilt, start, heading.rpy_rad[2] if heading and heading.acts else start.rpy_rad[2])
     if heading:
         yield heading.finding(tilt)

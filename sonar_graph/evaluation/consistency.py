@@ -152,8 +152,8 @@ def reliability(confidence: Floats, right: Floats) -> Reliability:
 
 
 def reliability_of(sequence: Sequence) -> Reliability | None:
-    """Reliability of a sequence's detections; None without them, without truth, or if none can be judged."""
-    if sequence.detections is None or sequence.truth is None or sequence.true_landmarks is None:
+    """Reliability of a sequence's detections; None without them, without true poses, or if none can be judged."""
+    if sequence.detections is None or sequence.true_poses is None or sequence.true_landmarks is None:
         return None
     labels = true_identities(sequence, sequence.detections)
     judged = labels != UNJUDGED
@@ -172,9 +172,9 @@ def confidences(detections: LandmarkDetections) -> tuple[Floats, Ints]:
 
 def true_identities(sequence: Sequence, detections: LandmarkDetections) -> Ints:
     """The true class of each detection, shape (n,): an identity, `NONE` or `UNJUDGED`."""
-    assert sequence.truth is not None
-    assert sequence.true_landmarks is not None
-    truth, landmarks = sequence.truth, sequence.true_landmarks
+    truth, landmarks = sequence.true_poses, sequence.true_landmarks
+    assert truth is not None
+    assert landmarks is not None
     labels = np.full(len(detections), UNJUDGED)
     within = (detections.stamps_ns >= truth.stamps_ns[0]) & (detections.stamps_ns <= truth.stamps_ns[-1])
     stamps_ns, frame = np.unique(detections.stamps_ns[within], return_inverse=True)

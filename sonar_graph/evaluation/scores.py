@@ -41,7 +41,8 @@ def trajectory_scores(
 ) -> dict[str, Score]:
     """Accuracy and consistency of one trajectory, under keys that begin with its kind.
 
-    Estimate, truth and errors are at the scored instants; ``instants`` has these in words, for the protocols.
+    Estimate, truth and errors are at the scored instants; ``instants`` has these in words, for the protocols. Scores
+    that need true orientations are left out where the truth has positions only.
     """
     which, over = ESTIMATES[kind], f"over {instants}, to which the truth is interpolated"
     fitted = "without scale (Umeyama 1991), fitted to these instants: rms of"
@@ -54,10 +55,10 @@ def trajectory_scores(
         ("return_error_m", return_error_m(estimate, truth), "m",
          "not aligned: norm of estimated minus true displacement from the first to the last,"),
     ]  # fmt: skip
-    scores = {key: Score(value, unit, f"{which}, {rule} {over}.") for key, value, unit, rule in rules}
+    scores = _finite({key: Score(value, unit, f"{which}, {rule} {over}.") for key, value, unit, rule in rules})
     for delta_s in RELATIVE_DELTAS_S:
         relative = relative_errors(estimate, truth, delta_s)
-        if not len(relative):
+        if not len(relative) or not truth.has_orientation:
             continue
         pairs = f"over {len(relative)} overlapping pairs {delta_s} s apart, {over}"
         scores[f"rpe_{delta_s}s_m"] = Score(

@@ -144,13 +144,14 @@ def _state(run: RunResult) -> dict[str, Any]:
 
 def _error_summary(series: ErrorSeries) -> dict[str, Any]:
     """Raw errors by axis in a few numbers; the series itself is in the run's arrays."""
-    return {
+    summary = {
         "instants": len(series.stamps_ns),
         "rms_xyz_m": [rmse(series.position_m[:, axis]) for axis in range(3)],
         "max_position_m": float(np.linalg.norm(series.position_m, axis=1).max()),
-        "rms_yaw_rad": rmse(series.yaw_rad),
-        "max_yaw_rad": float(np.abs(series.yaw_rad).max()),
     }
+    if np.isnan(series.yaw_rad).any():  # the truth has positions only
+        return summary
+    return summary | {"rms_yaw_rad": rmse(series.yaw_rad), "max_yaw_rad": float(np.abs(series.yaw_rad).max())}
 
 
 def write_viewer_files(comparison: Comparison, folder: Path) -> None:

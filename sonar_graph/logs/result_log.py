@@ -12,8 +12,8 @@ For each estimator ``NAME`` (as `source_names` spells it), in the frame ``map``:
 ``/NAME/landmark_cloud``   ``sensor_msgs/PointCloud2`` at the end: position, identity, covariance
 ``/tf``                    ``map`` to ``NAME/base_link``, and to ``base_link``, which follows the first estimator
 ``/tf_static``             ``base_link`` to the sensors
-``/ground_truth/...``      ``odometry``, ``path``, ``landmarks``, ``landmark_cloud`` from the start, and its
-                           frame in ``/tf``, where known
+``/ground_truth/...``      ``odometry`` (of positions only ``point``), ``path``, ``landmarks``, ``landmark_cloud``
+                           from the start, and its frame in ``/tf``, where known
 ``/sonar/recognised``      ``sensor_msgs/CompressedImage``: sonar images with the recognised identities drawn in
 =========================  ==============================================================================
 
@@ -38,6 +38,7 @@ from sonar_graph.logs.writing import (
     header,
     odometry_messages,
     outgoing,
+    point_messages,
     pose_messages,
     static_message,
 )
@@ -95,7 +96,10 @@ def write_result(
     colours = {name: _COLOURS[i % len(_COLOURS)] for i, name in enumerate(sources)} | {TRUTH: viewer.GREY}
     messages = [static_message("/tf_static", TF, sequence.start_ns, encode_mountings(sequence.calibration))]
     if truth is not None and len(truth):
-        messages.append(odometry_messages(f"/{TRUTH}/odometry", truth, f"{TRUTH}/{BODY_FRAME}"))
+        if truth.has_orientation:
+            messages.append(odometry_messages(f"/{TRUTH}/odometry", truth, f"{TRUTH}/{BODY_FRAME}"))
+        else:
+            messages.append(point_messages(f"/{TRUTH}/point", truth))
         messages.append(_path(f"/{TRUTH}/path", _drawable(truth), sequence.start_ns))
     if landmarks is not None:
         messages += _landmarks(TRUTH, landmarks, sequence.start_ns, viewer.GREY, scene)
@@ -178,7 +182,8 @@ def _path(topic: str, trajectory: Trajectory, stamp_ns: int) -> Outgoing:
     at_ns = np.array([stamp_ns])
     poses = header(trajectory.stamps_ns, WORLD_FRAME, "poses.header")
     poses |= fields("poses.pose.position", "xyz", trajectory.positions)
-    poses |= fields("poses.pose.orientation", "xyzw", trajectory.quaternions_xyzw)
+    quaternions = trajectory.quaternions_xyzw if trajectory.has_orientation else np.array([[0.0, 0.0, 0.0, 1.0]])
+    poses |= fields("poses.pose.orientation", "xyzw", np.broadcast_to(quaternions, (len(trajectory), 4)))
     values = header(at_ns, WORLD_FRAME) | poses
     return outgoing(topic, viewer.PATH, at_ns, values, {"poses": len(trajectory)}, is_latched=True)
 
@@ -186,8 +191,8 @@ def _path(topic: str, trajectory: Trajectory, stamp_ns: int) -> Outgoing:
 def _bodies(sequence: Sequence, sources: Mapping[str, Estimates]) -> dict[str, Trajectory]:
     """Trajectories of body frames: the sensors', each causal estimate's, and the truth's at the estimates' instants."""
     bodies = {f"{name}/{BODY_FRAME}": causal for name, (causal, _, _) in sources.items() if len(causal)}
-    owner = next(iter(bodies.values()), sequence.truth)
-    truth = sequence.truth
+    truth = sequence.true_poses
+    owner = next(iter(bodies.values()), truth)
     if truth is not None and len(truth):
         instants_ns = np.unique(np.concatenate([b.stamps_ns for b in bodies.values()] or [_drawable(truth).stamps_ns]))
         within = (instants_ns >= truth.stamps_ns[0]) & (instants_ns <= truth.stamps_ns[-1])

@@ -101,9 +101,9 @@ def label_of(sighting: ObjectSighting, ids: Ints, range_m: Floats, azimuth_rad: 
 
 def true_ranges_azimuths(run: Run, stamp_ns: int) -> tuple[Floats, Floats]:
     """True range and azimuth of every landmark at an instant, shapes (m,)."""
-    assert run.truth is not None
+    assert run.true_poses is not None
     assert run.true_landmarks is not None
-    pose = run.truth.at(np.array([stamp_ns]))
+    pose = run.true_poses.at(np.array([stamp_ns]))
     mounting = run.calibration.sonar.mounting.pose()
     world_R_body = pose.matrices[0]
     origin = pose.positions[0] + world_R_body @ mounting.translation()
@@ -145,8 +145,9 @@ def calibrate(
     designs = tuple(designs or DEFAULT_DESIGNS)
     gathered = LabelledSightings(tuple(design.id for design in designs))
     for log, (path, run) in enumerate(logs):
-        if run.truth is None or run.true_landmarks is None:
-            raise CalibrationError(f"{path}: without true trajectory and true landmarks nothing in it can be labelled")
+        truth = run.true_poses
+        if truth is None or run.true_landmarks is None:
+            raise CalibrationError(f"{path}: without true poses and true landmarks nothing in it can be labelled")
         in_log = run.true_landmarks.ids.tolist()
         if not set(gathered.ids) & set(in_log):
             true, known = (", ".join(map(str, sorted(ids))) for ids in (in_log, gathered.ids))
@@ -157,7 +158,7 @@ def calibrate(
         recogniser = Recogniser(run.calibration, designs, params)
         session = RecognitionSession(run, recogniser=recogniser, pictures=False)
         for stamp_ns in session.run(read_sonar_frames(path, topic, config, salvage=salvage)):
-            if recogniser.stamp_ns != stamp_ns or not run.truth.stamps_ns[0] <= stamp_ns <= run.truth.stamps_ns[-1]:
+            if recogniser.stamp_ns != stamp_ns or not truth.stamps_ns[0] <= stamp_ns <= truth.stamps_ns[-1]:
                 continue
             range_m, azimuth_rad = true_ranges_azimuths(run, stamp_ns)
             for track, sighting in zip(recogniser.track_ids.tolist(), recogniser.sightings, strict=True):

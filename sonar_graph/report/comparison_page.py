@@ -124,7 +124,7 @@ def render_report(comparison: Comparison) -> str:
         "summary": (
             f"{format_value(round(sequence.duration_s, 1))} s of "
             f"{'planar' if sequence.calibration.planar else 'three-dimensional'} motion "
-            f"{'without' if sequence.truth is None else 'with'} ground truth, "
+            f"{_of_truth(sequence)}, "
             f"{_counted(detections, 'landmark detection')}, {len(comparison.instants_ns)} instants, "
             f"{_counted(len(runs), 'estimator')}."
         ),
@@ -279,9 +279,15 @@ def recognition_content(comparison: Comparison) -> dict[str, Any] | None:
     }
 
 
+def _of_truth(sequence: Sequence) -> str:
+    if sequence.truth is None:
+        return "without ground truth"
+    return "with ground truth" if sequence.true_poses else "with true positions, but no true orientation"
+
+
 def naming_table(sequence: Sequence) -> Table | None:
     """Detections by their true class: named rightly, named wrongly, taken for no landmark; None without truth."""
-    if sequence.detections is None or sequence.truth is None or sequence.true_landmarks is None:
+    if sequence.detections is None or sequence.true_poses is None or sequence.true_landmarks is None:
         return None
     labels = true_identities(sequence, sequence.detections)
     _, named = confidences(sequence.detections)

@@ -38,7 +38,9 @@ def error_figure(comparison: Comparison) -> Figure | None:
         return None
     series = [comparison.errors[run.estimator]["causal"] for _, run in runs]
     axes_count = max(errors.position_dof for errors in series)
-    labels = [*(f"error in {'xyz'[axis]} (m)" for axis in range(axes_count)), "yaw error (°)"]
+    labels = [f"error in {'xyz'[axis]} (m)" for axis in range(axes_count)]
+    if any(np.isfinite(errors.yaw_rad).any() for errors in series):
+        labels.append("yaw error (°)")
     figure, axes = style.blank_panels(len(labels), len(runs), _size(len(labels), len(runs)), sharex=True)
     for column, ((index, run), errors) in enumerate(zip(runs, series, strict=True)):
         style.head_panel(axes[0, column], run.estimator, style.colour(index))
@@ -58,7 +60,7 @@ def error_figure(comparison: Comparison) -> Figure | None:
             rows = style.thinned(error)
             panel.axhline(0.0, color=style.MUTED, linewidth=0.7)
             panel.plot(seconds[rows], error[rows], color=style.colour(index), linewidth=1.1)
-            style.name_axes(panel, TIME_LABEL if row == axes_count else "", "" if column else label)
+            style.name_axes(panel, TIME_LABEL if row == len(labels) - 1 else "", "" if column else label)
     return figure
 
 
@@ -69,7 +71,7 @@ def yaw_figure(comparison: Comparison) -> Figure | None:
         return None
     figure, axes = style.blank_panels(1, 1, SINGLE_IN)
     panel: Axes = axes[0, 0]
-    truth = comparison.sequence.truth
+    truth = comparison.sequence.true_poses
     if truth is not None and len(truth):
         seconds, degrees = _headings(comparison, truth)
         panel.plot(seconds, degrees, color=style.TRUTH, linewidth=3.2, alpha=0.6, label="truth")
@@ -94,16 +96,20 @@ def nees_figure(comparison: Comparison) -> Figure | None:
             runs.append((index, run))
     if not runs:
         return None
-    figure, axes = style.blank_panels(2, len(runs), _size(2, len(runs)), sharex=True, sharey=True)
+    has_yaw = any(np.isfinite(comparison.errors[run.estimator]["causal"].nees_yaw).any() for _, run in runs)
+    count = 2 if has_yaw else 1
+    figure, axes = style.blank_panels(count, len(runs), _size(count, len(runs)), sharex=True, sharey=True)
     for column, (index, run) in enumerate(runs):
         errors = comparison.errors[run.estimator]["causal"]
         style.head_panel(axes[0, column], run.estimator, style.colour(index))
         seconds = style.seconds_since_start(comparison, errors.stamps_ns)
         blocks = (("position", errors.nees_position, errors.position_dof), ("yaw", errors.nees_yaw, 1))
-        for row, (label, nees, dof) in enumerate(blocks):
+        for row, (label, nees, dof) in enumerate(blocks[:count]):
             style.logarithmic(axes[row, column], "y")
             _draw_nees(axes[row, column], seconds, nees, dof, style.colour(index))
-            style.name_axes(axes[row, column], TIME_LABEL if row else "", "" if column else f"{label} NEES / dof")
+            style.name_axes(
+                axes[row, column], TIME_LABEL if row == count - 1 else "", "" if column else f"{label} NEES / dof"
+            )
     return figure
 
 

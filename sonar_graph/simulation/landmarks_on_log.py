@@ -117,12 +117,13 @@ def reference_path(recorded: Sequence) -> tuple[int, VehiclePath]:
 
     Its poses are thinned to one in `KNOT_S`: the noise of a quick reference is no motion.
     """
-    if recorded.truth is None or not len(recorded.truth):
+    reference = recorded.true_poses
+    if reference is None or not len(reference):
         raise SimulationError(
-            f"{recorded.name}: no reference trajectory, along which landmarks could lie; "
+            f"{recorded.name}: no reference trajectory with orientations, along which landmarks could lie; "
             "name its topic with --topic truth=TOPIC"
         )
-    stamps_ns = recorded.truth.stamps_ns
+    stamps_ns = reference.stamps_ns
     inside = np.flatnonzero((stamps_ns >= recorded.start_ns) & (stamps_ns <= recorded.end_ns))
     if len(inside) < LEAST_POSES:
         raise SimulationError(
@@ -135,7 +136,7 @@ def reference_path(recorded: Sequence) -> tuple[int, VehiclePath]:
         if instant - knots[-1] >= KNOT_S - 1e-6:
             knots.append(instant)
     seconds = np.array(knots) if len(knots) >= LEAST_POSES else seconds
-    poses = recorded.truth.at(stamps_ns[0] + np.rint(seconds * NS_PER_S).astype(np.int64))
+    poses = reference.at(stamps_ns[0] + np.rint(seconds * NS_PER_S).astype(np.int64))
     angles = np.unwrap(rpy_from_rotation(poses.rotations()), axis=0)
     return int(stamps_ns[0]), VehiclePath.through(seconds, np.column_stack([poses.positions, angles]))
 
