@@ -35,6 +35,9 @@ VELOCITY_SIGMA_M_S = (0.01, 0.01, 0.005)
 BODY_P_DVL_M = (-1.84, 0.03, -0.1)
 BODY_P_IMU_M = (-1.76, 0.01, 0.1)
 START_RPY_SIGMA_RAD = (0.01, 0.01, 0.03)
+LEAST_POSES = 30
+OFFSETS_S = np.arange(-1.0, 1.005, 0.01)
+"""Offsets of the reference's stamps that are tried."""
 FILES = "TrajectoryN/{IMU,DVL,GT}_trajectoryN.csv"
 IMU_COLUMNS = ("Time", "ACC X", "ACC Y", "ACC Z", "GYRO X", "GYRO Y", "GYRO Z")
 DVL_COLUMNS = ("Time", "DVL X", "DVL Y", "DVL Z")
@@ -48,6 +51,29 @@ def enu_R_flu(roll_rad: Floats, pitch_rad: Floats, yaw_rad: Floats) -> Rotation:
     """
     ned_R_frd = Rotation.from_euler("ZYX", np.column_stack([yaw_rad, pitch_rad, roll_rad])).as_matrix()
     return Rotation.from_matrix(ENU_R_NED @ ned_R_frd @ np.diag(FLU_OF_FRD))
+
+
+def reference_offset_s(imu: Imu, reference: Trajectory) -> float:
+    """Seconds to add to the reference's stamps so that it turns when the gyros do; 0 where that cannot be told.
+
+    The offset τ, of those `OFFSETS_S`, whose sum of ``|Log(R_k^T R_k+1) - ∫ ω dt - mean|²`` is least; the integral is
+    from ``t_k + τ`` to ``t_k+1 + τ``, and the mean is what gyro bias and the Earth add.
+    """
+    if len(reference) < LEAST_POSES:
+        return 0.0
+    seconds, knots = ((ns - imu.stamps_ns[0]) * 1e-9 for ns in (imu.stamps_ns, reference.stamps_ns))
+    steps = 0.5 * (imu.angular_velocity[1:] + imu.angular_velocity[:-1]) * np.diff(seconds)[:, None]
+    turned = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    knots = knots[(knots + OFFSETS_S[0] >= seconds[0]) & (knots + OFFSETS_S[-1] <= seconds[-1])]
+    rotations = reference.at(imu.stamps_ns[0] + np.rint(knots * NS_PER_S).astype(np.int64)).rotations()
+    of_reference = (rotations[:-1].inv() * rotations[1:]).as_rotvec()
+
+    def misfit(offset_s: float) -> float:
+        by_gyros = [np.diff(np.interp(knots + offset_s, seconds, turned[:, axis])) for axis in range(3)]
+        return float(np.var(np.column_stack(by_gyros) - of_reference, axis=0).sum())
+
+    best = int(np.argmin([misfit(offset_s) for offset_s in OFFSETS_S]))
+    return float(OFFSETS_S[best]) if 0 < best < len(OFFSETS_S) - 1 else 0.0
 
 
 def read_akit(dataset_dir: Path, trajectory: int) -> Sequence:
@@ -90,7 +116,8 @@ def read_akit(dataset_dir: Path, trajectory: int) -> Sequence:
     start_ns = int(max(imu.stamps_ns[0], dvl.stamps_ns[0]))
     if truth.stamps_ns[-1] < start_ns:
         raise DatasetError(f"{folder}: the reference has fewer than two rows; expected one a second")
-    start = truth.at(np.array([start_ns]))
+    at_ns = start_ns - round(reference_offset_s(imu, truth) * NS_PER_S)  # in a turn half a second is degrees
+    start = truth.at(np.clip(np.array([at_ns]), truth.stamps_ns[0], truth.stamps_ns[-1]))
     x, y, z = start.positions[0].tolist()
     yaw, pitch, roll = start.rotations().as_euler("ZYX")[0].tolist()
     calibration = Calibration(
@@ -117,7 +144,8 @@ def read_akit(dataset_dir: Path, trajectory: int) -> Sequence:
             "licence": "none stated; the authors ask to be cited",
             "truth": "navigation system computed from the same IMU and DVL: a reference, no independent truth",
             "time": "rows timed by their number (IMU 100 Hz, DVL and reference 1 Hz), DVL one second later; "
-            "poses of the reference are 0.4 to 0.5 s older (trajectories 1-4, 7) or newer (5, 6) than their time says",
+            "poses of the reference are 0.4 to 0.5 s older (trajectories 1-4, 7) or newer (5, 6) than their time says; "
+            "the start is its pose at the time at which it turns as the gyros do",
             "imu": "y axes negated; forward-right-down turned to forward-left-up",
         },
     )
