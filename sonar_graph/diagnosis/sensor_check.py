@@ -55,6 +55,10 @@ SHARE_OF_GRAVITY = 0.2
 """Relative difference allowed between a typical specific force and gravity."""
 USUAL_SPEED_M_S = 3.0
 HIGH_PERCENTILE = 95.0
+LEAST_SECONDS = 30
+LEAST_TILTING_RAD_S = 0.02
+LARGEST_TILT_RATIO = 10.0
+"""Tilting by gyros over that by gravity: below 1 in rad/s but for the gyros' noise, up to 57 in degrees."""
 
 
 def wrong_units(sequence: Sequence, config: LogConfig) -> list[Finding]:
@@ -69,11 +73,14 @@ def wrong_units(sequence: Sequence, config: LogConfig) -> list[Finding]:
             f"`scale = {scale:.4g}` under [dvl] {IN_LOG_CONFIG}"
         )
     rate_rad_s = _exceeded_by_few(sequence.imu.angular_velocity)
-    if rate_rad_s > FASTEST_TURN_RAD_S:
+    tilting = tilt_rates(sequence.imu)
+    doubt = f"57 times too large (up to {rate_rad_s:.3g} rad/s)" if rate_rad_s > FASTEST_TURN_RAD_S else ""
+    if not doubt and tilting and tilting[0] > max(LEAST_TILTING_RAD_S, LARGEST_TILT_RATIO * tilting[1]):
+        doubt = "too large (they tilt the vehicle by {:.2g} rad/s, gravity by {:.2g})".format(*tilting)
+    if doubt:
         scale = float(config.table("imu").get("angular_velocity_scale", 1.0)) * np.radians(1.0)
         advice["gyro: unit"] = (
-            f"rates look 57 times too large (up to {rate_rad_s:.3g} rad/s): degrees a second? "
-            f"`angular_velocity_scale = {scale:.5g}` under [imu] {IN_LOG_CONFIG}"
+            f"rates look {doubt}: degrees a second? `angular_velocity_scale = {scale:.5g}` under [imu] {IN_LOG_CONFIG}"
         )
     forces, gravity = _lengths(sequence.imu.specific_force), sequence.calibration.gravity_m_s2
     typical = float(np.median(forces)) if len(forces) else 0.0
@@ -86,6 +93,25 @@ def wrong_units(sequence: Sequence, config: LogConfig) -> list[Finding]:
         )
     unknown = Estimate1D(np.nan, np.inf, "wrong unit")
     return [Finding(quantity, unknown, "", line, acts=True) for quantity, line in advice.items()]
+
+
+def tilt_rates(imu: Imu) -> tuple[float, float] | None:
+    """Median rates of tilting by the gyros and by the accelerometers, rad/s; None where these tell nothing.
+
+    From second to second gravity turns in the sensor by ``u_k+1 - u_k = -θ x u_k``, and the force also by what
+    accelerates the vehicle: the accelerometers' rate is too large, never too small.
+    """
+    names, first, count = np.unique((imu.stamps_ns - imu.stamps_ns[0]) // NS_PER_S, True, False, True)
+    force = np.add.reduceat(imu.specific_force, first, axis=0)
+    is_next = np.diff(names) == 1
+    if np.count_nonzero(is_next) < LEAST_SECONDS or not np.isfinite(force).all() or not force.any(axis=1).all():
+        return None
+    up = force / np.linalg.norm(force, axis=1)[:, None]
+    rate = np.add.reduceat(imu.angular_velocity, first, axis=0) / count[:, None]
+    rate = rate - np.median(rate, axis=0)  # a bias turns nothing
+    by_gyros = np.linalg.norm(np.cross((rate[1:] + rate[:-1]) / 2, up[:-1]), axis=1)
+    by_gravity = np.linalg.norm(np.diff(up, axis=0), axis=1)
+    return float(np.median(by_gyros[is_next])), float(np.median(by_gravity[is_next]))
 
 
 def _exceeded_by_few(vectors: Floats) -> float:

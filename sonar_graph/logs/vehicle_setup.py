@@ -82,8 +82,8 @@ def encode_mountings(calibration: Calibration) -> Bytes:
         "imu": calibration.imu.mounting,
         "dvl": calibration.dvl.mounting,
         "depth": Mounting(translation_m=calibration.depth.port_m),
-        "positions": Mounting(translation_m=calibration.positions.antenna_m),
         "sonar": calibration.sonar.mounting,
+        "positions": Mounting(translation_m=calibration.positions.antenna_m),
     }
     quaternions = Rotation.from_matrix([m.pose().rotation().matrix() for m in mountings.values()]).as_quat()
     translations = np.array([m.translation_m for m in mountings.values()])

@@ -18,7 +18,7 @@ from sonar_graph.logs.cdr.definitions import definition
 from sonar_graph.logs.mcap.file_summary import TimeWindow
 from sonar_graph.logs.mcap.reader import Recording, scan
 from sonar_graph.logs.mcap.topic import Keep, Topic
-from sonar_graph.measurements import Depth, Dvl, Imu, LandmarkDetections
+from sonar_graph.measurements import Depth, Dvl, Heading, Imu, LandmarkDetections, PositionFixes
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import LandmarkMap, Trajectory
 
@@ -148,6 +148,8 @@ def sequence_with(seed: int = 0, samples: int = 20, candidates: int = 2) -> Sequ
         imu=Imu(stamps, rng.normal(size=(samples, 3)), force),
         dvl=Dvl(stamps, rng.normal(size=(samples, 3)), covs),
         depth=Depth(stamps, rng.normal(size=samples), np.where(np.arange(samples) % 2, np.nan, 0.01)),
+        heading=Heading(stamps, 10 * rng.normal(size=samples), np.where(np.arange(samples) % 3, 0.1, np.nan)),
+        positions=PositionFixes(stamps, rng.normal(size=(samples, 3)), covs),
         detections=LandmarkDetections(
             frames,
             rng.uniform(1, 5, samples),

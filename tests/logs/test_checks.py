@@ -232,9 +232,10 @@ def test_rows_that_do_not_say_their_noise_are_counted() -> None:
     doppler, depth = dvl(five), Depth(stamps(five), np.zeros(5), np.full(5, 1e-4))
     known, ones = np.tile(np.eye(2), (5, 1, 1)), np.ones((5, 1))
     detections = LandmarkDetections(stamps(five), np.ones(5), np.zeros(5), known, ones.astype(int), ones)
-    assert list(unsaid_noise(doppler, depth, detections)) == []
+    blocks = {"dvl": doppler, "depth": depth, "heading": None, "detections": detections}
+    assert list(unsaid_noise(blocks)) == []
     doppler.velocity_cov[1:3, 2, 2] = depth.variance_m2[0] = detections.range_azimuth_cov[:] = np.nan
-    assert list(unsaid_noise(doppler, depth, detections)) == [
+    assert list(unsaid_noise(blocks)) == [
         "dvl: 2 of 5 rows say no covariance, dvl.velocity_sigma_m_s of the calibration count",
         "depth: 1 of 5 rows say no covariance, depth.sigma_m of the calibration count",
         "detections: 5 of 5 rows say no covariance, sonar.range_sigma_m and azimuth_sigma_rad of the calibration count",

@@ -111,7 +111,7 @@ def test_tf_is_a_tree_below_the_map_whose_transforms_of_one_instant_share_a_mess
     for transform in [t for m in result.messages["/tf"] + result.messages["/tf_static"] for t in m.transforms]:
         parents.setdefault(transform.child_frame_id, set()).add(transform.header.frame_id)
         xs.setdefault(transform.child_frame_id, []).append(transform.transform.translation.x)
-    sensors = {sensor: {"base_link"} for sensor in ("imu", "dvl", "depth", "sonar")}
+    sensors = {sensor: {"base_link"} for sensor in ("imu", "dvl", "depth", "sonar", "positions")}
     bodies = ("base_link", "ekf_slam/base_link", "isam2/base_link", "ground_truth/base_link")
     assert parents == sensors | {body: {"map"} for body in bodies}
     assert {m.child_frame_id for m in result.messages["/isam2/odometry"]} <= parents.keys()

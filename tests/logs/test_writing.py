@@ -32,7 +32,7 @@ from sonar_graph.states import Trajectory
 from .conftest import chunk_indexes, decode, flip, scan_all
 
 T0_NS = 1_700_000_000_000_000_000
-BLOCKS = ("imu", "dvl", "depth", "detections", "truth", "true_landmarks")
+BLOCKS = ("imu", "dvl", "depth", "heading", "positions", "detections", "truth", "true_landmarks")
 
 
 @settings(max_examples=25)
@@ -63,7 +63,8 @@ def test_mcap_ros2_support_decodes_what_is_written(make_sequence, tmp_path):
     write_log(tmp_path / "a.mcap", sequence)
     messages = decode(tmp_path / "a.mcap")
     assert set(messages) == {"/imu/data", "/dvl/data", "/depth/pose", "/sonar/landmarks", "/tf_static",
-                             "/ground_truth/odometry", "/ground_truth/landmarks"}  # fmt: skip
+                             "/ground_truth/odometry", "/ground_truth/landmarks", "/heading",
+                             "/fixes/pose"}  # fmt: skip
     imu = messages["/imu/data"]
     stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in imu]
     assert stamps == sequence.imu.stamps_ns.tolist()
@@ -72,11 +73,13 @@ def test_mcap_ros2_support_decodes_what_is_written(make_sequence, tmp_path):
     assert [m.linear_acceleration_covariance[0] for m in imu] == [-1.0 if i % 4 == 0 else 0.0 for i in range(20)]
     assert [m.velocity_mode for m in messages["/dvl/data"]] == [1] * 20
     assert [m.pose.pose.position.z for m in messages["/depth/pose"]] == sequence.depth.z_m.tolist()
+    assert [m.yaw_rad for m in messages["/heading"]] == sequence.heading.yaw_rad.tolist()
+    assert [m.pose.pose.position.y for m in messages["/fixes/pose"]] == sequence.positions.position_m[:, 1].tolist()
     ranges = [r for m in messages["/sonar/landmarks"] for r in m.range_m]
     assert ranges == sequence.detections.range_m.tolist()
     assert list(messages["/ground_truth/landmarks"][0].ids) == [3, 7]
     (tree,) = messages["/tf_static"]
-    assert [t.child_frame_id for t in tree.transforms] == ["imu", "dvl", "depth", "sonar"]
+    assert [t.child_frame_id for t in tree.transforms] == ["imu", "dvl", "depth", "sonar", "positions"]
     assert tree.transforms[0].transform.translation.y == 0.2
 
 

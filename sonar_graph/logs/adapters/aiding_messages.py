@@ -19,7 +19,7 @@ from sonar_graph.calibration import Section
 from sonar_graph.logs.adapters.adapter import Adapter, CovarianceFields, Scale, axes_matrix, field_paths
 from sonar_graph.logs.adapters.message_table import NOT_FINITE, Dropped, MessageTable, fit_rows, not_finite
 from sonar_graph.logs.geodesy import Origin, east_north_up
-from sonar_graph.logs.mcap import Topic
+from sonar_graph.logs.mcap import Keep, Topic
 from sonar_graph.measurements import UNMEASURED_M2, Floats, Heading, PositionFixes
 
 ENU_R_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -61,7 +61,7 @@ class HeadingAdapter(Adapter):
 
     def refusal(self, topic: Topic) -> str | None:
         """Reason why no message has a heading, which completes "/imu ..."."""
-        if not len(topic) or self.is_measured(self.table(topic)).any():
+        if topic.keep is not Keep.ALL or not topic.messages() or self.is_measured(self.table(topic)).any():
             return None
         field = self.variance.fields[0] if self.variance and self.needs_variance else self.status
         return (

@@ -271,6 +271,12 @@ def detection_warnings(detections: LandmarkDetections, first_ns: int, last_ns: i
     for fault, has_it in faults.items():
         if has_it.any():
             yield f"{np.count_nonzero(has_it)} of {len(detections)} rows have {fault}: estimators do not use them"
+    beyond = np.count_nonzero(np.abs(detections.azimuth_rad) > np.pi)
+    if beyond:
+        yield (
+            f"{beyond} of {len(detections)} rows have an azimuth beyond ±3.14 rad (up to "
+            f"{np.abs(detections.azimuth_rad).max():.3g}): degrees? They are taken as rad"
+        )
     tracked = detections.track != NO_TRACK
     pairs = np.column_stack((detections.stamps_ns[tracked], detections.track[tracked]))
     different, counts = np.unique(pairs, axis=0, return_counts=True)

@@ -57,7 +57,14 @@ def degrees_of_freedom(count: int, together: int) -> float:
 
 
 def density(samples: Floats, rate_hz: float) -> Estimate1D:
-    """Root spectral density at one second of the noisiest of (n, columns) readings of a still sensor."""
+    """Root spectral density at one second of the noisiest of (n, columns) readings of a still sensor.
+
+    Unknown where all are equal: no sensor is without noise, and an estimator told so believes it.
+    """
+    if not np.ptp(samples, axis=0).any():
+        return Estimate1D(
+            np.nan, np.inf, "the same to the last bit while still: commanded, or too coarse for its noise"
+        )
     together = max(1, round(TAU_S * rate_hz))
     tau_s = together / rate_hz
     value = float(allan_deviation(samples, together).max()) * np.sqrt(tau_s)
