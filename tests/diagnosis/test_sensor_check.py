@@ -279,6 +279,39 @@ def test_what_is_usual_is_not_doubted_and_gravity_is_that_of_the_calibration():
     assert fault.advice.startswith("rates look 57 times too large (up to 2.1 rad/s): degrees a second? ")
 
 
+def test_slow_rates_in_degrees_are_told_by_gravity():
+    """They tilt the vehicle 57 times farther than gravity turns in the accelerometers; radians, by as much.
+
+    A constant bias tilts nothing. Without accelerometers nothing is said.
+    """
+    imu = RIGHT.imu
+    for turn, acts in ((np.degrees(1.0), True), (1.0, False)):
+        rates = imu.angular_velocity * turn
+        assert np.percentile(np.linalg.norm(rates, axis=1), 95) < 10.0
+        slow = replace(RIGHT, imu=replace(imu, angular_velocity=rates * [1, 1, 0] + [0.5, -0.5, 0.0]))
+        faults = sensor_check.wrong_units(slow, LogConfig())
+        assert [fault.quantity for fault in faults] == ["gyro: unit"] * acts
+        unmeasured = replace(slow.imu, specific_force=np.full_like(imu.specific_force, np.nan))
+        assert not sensor_check.wrong_units(replace(slow, imu=unmeasured), LogConfig())
+        if acts:
+            assert line_of(faults[0]) == pytest.approx({"angular_velocity_scale": np.pi / 180}, rel=1e-4)
+            assert "they tilt the vehicle by" in faults[0].advice
+
+
+def test_readings_that_never_change_have_no_noise_to_be_told():
+    """A density of zero would be believed; one changed digit is noise again."""
+    commanded = with_rows(
+        np.zeros((6000, 3)), 0.01 * np.random.default_rng(1).standard_normal((6000, 3)), np.zeros((300, 3))
+    )
+    gyro = by_name(list(sensor_check.noise_findings(commanded)))["gyro noise density"]
+    assert not gyro.acts
+    assert gyro.text().startswith("cannot be told: the same to the last bit while still")
+    changed = np.zeros((6000, 3))
+    changed[::7] = 1e-4
+    moved = with_rows(changed, np.zeros((6000, 3)), np.zeros((300, 3)))
+    assert by_name(list(sensor_check.noise_findings(moved)))["gyro noise density"].estimate.is_known
+
+
 def test_what_the_configuration_scales_is_taken_over():
     imu = {"angular_velocity_scale": -1.0, "linear_acceleration_scale": 2.0}
     faults = units(speed=200.0, turn=20.0, force=1.0, dvl={"scale": 3.0}, imu=imu)

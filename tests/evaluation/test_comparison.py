@@ -11,7 +11,7 @@ from sonar_graph.evaluation.results import RunResult
 from sonar_graph.evaluation.run import run_estimator
 from sonar_graph.evaluation.scores import detection_scores, resource_scores
 from sonar_graph.measurements import Measurements
-from sonar_graph.states import DetectionLog, Estimate, Outcome
+from sonar_graph.states import DetectionLog, Estimate, Outcome, Trajectory
 
 from .conftest import Offset, straight_sequence
 
@@ -52,6 +52,25 @@ def test_scores_of_a_constant_offset_by_hand_each_with_unit_and_protocol(install
     assert "40 of 40 instants" in scores["causal.ate_se2_m"].protocol
     assert "SE(2)" in scores["causal.ate_se2_m"].protocol
     assert scores["smoothed.ate_raw_m"].protocol.startswith("Smoothed")
+
+
+def test_truth_with_positions_only_scores_positions_alone(install):
+    """Nothing that needs a true orientation is scored, drawn or summed up; what is scored has the same value."""
+    whole = straight_sequence()
+    positions = replace(whole, truth=Trajectory.of_positions(whole.truth.stamps_ns, whole.truth.positions))
+    settings = {"offset": {"offset_m": 0.4, "sigma_m": 0.1}}
+    full, partial = (compare(sequence, ["offset"], settings) for sequence in (whole, positions))
+    lacking = {
+        f"{kind}.{key}"
+        for kind in ("causal", "smoothed")
+        for key in ("yaw_rmse_rad", "nees_yaw", "rpe_1s_m", "rpe_10s_m", "rpe_1s_rad", "rpe_10s_rad")
+    }
+    scores = partial.scores["offset"]
+    assert full.scores["offset"].keys() - {"memory.peak_mb"} - scores.keys() == lacking
+    for key, score in scores.items():
+        if not key.startswith(("time", "memory")):
+            assert score.value == full.scores["offset"][key].value, key
+    assert np.isnan(partial.errors["offset"]["causal"].yaw_rad).all()
 
 
 def test_ignored_detections_are_neither_used_nor_refused():

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -6,9 +8,11 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
 from sonar_graph.calibration import Mounting
+from sonar_graph.diagnosis.findings import find_start_heading
 from sonar_graph.logs.convert.akit import enu_R_flu, read_akit
 from sonar_graph.logs.geodesy import earth_centred, east_north_up
 from sonar_graph.navigation import Odometry
+from sonar_graph.navigation.alignment import match_reference_to_imu
 
 LATITUDE = 0.5733
 EARTH_RATE_RAD_S = 7.292115e-5
@@ -80,6 +84,41 @@ def test_small_offsets_are_the_radii_of_curvature_times_the_angles(latitude, lon
     assert np.allclose(enu[2] - enu[0], [(vertical - 5) * np.cos(latitude) * d, 0, 0], rtol=0, atol=1e-4)
     assert np.allclose(enu[3] - enu[0], [0, 0, 3], rtol=0, atol=1e-4)
     assert np.allclose(enu[0], [0, 0, -5], rtol=0, atol=1e-6)
+
+
+def test_the_start_is_where_a_reference_that_is_late_turns_as_the_gyros_do(tmp_path):
+    """Half a second at up to 11 degrees a second; the IMU's own z is the file's."""
+    run = tmp_path / "Trajectory2"
+    run.mkdir()
+
+    def heading(seconds):
+        return 0.5 * np.sin(0.4 * seconds) + 0.1 * seconds
+
+    def write(kind, rows):
+        text = "\n".join(["header", *(",".join(map(repr, map(float, row))) for row in rows)])
+        (run / f"{kind}_trajectory2.csv").write_text(text + "\n")
+
+    stamps = np.arange(6000) / 100
+    write("IMU", [(t, 0, 0, -9.8, 0, 0, 0.2 * np.cos(0.4 * t) + 0.1 + 1e-5) for t in stamps])
+    write("DVL", [(t, 1, 0, 0) for t in range(58)])
+    for late_s in (0.5, 0.0, -0.4):
+        write("GT", [(t, 0.61, LATITUDE, 0, 0, 0, 0, 0, 0, heading(t + late_s)) for t in range(60)])
+        yaw_rad = np.pi / 2 - read_akit(tmp_path, 2).calibration.start.rpy_rad[2]
+        assert yaw_rad == pytest.approx(heading(1.0), abs=0.005), late_s
+    write("GT", [(t, 0.61, LATITUDE, 0, 0, 0, 0, 0, 0, heading(t + 2.0)) for t in range(60)])  # farther than tried
+    assert np.pi / 2 - read_akit(tmp_path, 2).calibration.start.rpy_rad[2] == pytest.approx(heading(3.0), abs=0.005)
+
+
+@pytest.mark.recording
+@pytest.mark.parametrize("trajectory", [1, 4, 5, 6, 7])
+def test_inspect_does_not_call_the_start_heading_wrong(unpacked, trajectory):
+    sea = read_akit(next(unpacked("akit_1-7.tar.xz").rglob("Trajectory1")).parent, trajectory)
+    offset = match_reference_to_imu(sea.imu, sea.truth, sea.calibration).offset
+    assert not find_start_heading(sea, sea.truth, offset).acts
+    late = sea.truth.at(np.array([sea.start_ns])).rotations().as_euler("ZYX")[0, 0]
+    start = sea.calibration.start.model_copy(update={"rpy_rad": (0.0, 0.0, late)})
+    spoilt = replace(sea, calibration=sea.calibration.model_copy(update={"start": start}))
+    assert find_start_heading(spoilt, sea.truth, offset).acts == (trajectory != 7)  # which starts without turning
 
 
 @pytest.fixture(scope="module", params=[1, 3, 7])
