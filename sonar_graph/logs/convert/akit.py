@@ -56,8 +56,8 @@ def enu_R_flu(roll_rad: Floats, pitch_rad: Floats, yaw_rad: Floats) -> Rotation:
 def reference_offset_s(imu: Imu, reference: Trajectory) -> float:
     """Seconds to add to the reference's stamps so that it turns when the gyros do; 0 where that cannot be told.
 
-    The offset τ, of those `OFFSETS_S`, whose sum of ``|Log(R_k^T R_k+1) - ∫ ω dt - mean|²`` is least; the integral is
-    from ``t_k + τ`` to ``t_k+1 + τ``, and the mean is what gyro bias and the Earth add.
+    The offset τ, about one of `OFFSETS_S`, whose sum of ``|Log(R_k^T R_k+1) - ∫ ω dt - mean|²`` is least. The integral
+    is from ``t_k + τ`` to ``t_k+1 + τ``, and the mean is what gyro bias and the Earth add.
     """
     if len(reference) < LEAST_POSES:
         return 0.0
@@ -72,8 +72,14 @@ def reference_offset_s(imu: Imu, reference: Trajectory) -> float:
         by_gyros = [np.diff(np.interp(knots + offset_s, seconds, turned[:, axis])) for axis in range(3)]
         return float(np.var(np.column_stack(by_gyros) - of_reference, axis=0).sum())
 
-    best = int(np.argmin([misfit(offset_s) for offset_s in OFFSETS_S]))
-    return float(OFFSETS_S[best]) if 0 < best < len(OFFSETS_S) - 1 else 0.0
+    misfits = np.array([misfit(offset_s) for offset_s in OFFSETS_S])
+    best = int(np.argmin(misfits))
+    if not 0 < best < len(OFFSETS_S) - 1:
+        return 0.0
+    before, least, after = misfits[best - 1 : best + 2].tolist()  # the vertex of the parabola through them
+    return float(
+        OFFSETS_S[best] + 0.5 * (before - after) / (before - 2 * least + after) * (OFFSETS_S[1] - OFFSETS_S[0])
+    )
 
 
 def read_akit(dataset_dir: Path, trajectory: int) -> Sequence:
@@ -113,11 +119,14 @@ def read_akit(dataset_dir: Path, trajectory: int) -> Sequence:
     quaternions = enu_R_flu(*reference_rows[:, 7:10].T).as_quat()
     positions = east_north_up(latitude, longitude, altitude, (float(latitude[0]), float(longitude[0]), 0.0))
     truth = Trajectory.without_covariances(reference_ns, positions, quaternions)
+    offset_s = reference_offset_s(imu, truth)
+    shifted_ns = reference_ns + round(offset_s * NS_PER_S)
+    is_kept = shifted_ns >= 0
+    truth = Trajectory.without_covariances(shifted_ns[is_kept], positions[is_kept], quaternions[is_kept])
     start_ns = int(max(imu.stamps_ns[0], dvl.stamps_ns[0]))
     if truth.stamps_ns[-1] < start_ns:
         raise DatasetError(f"{folder}: the reference has fewer than two rows; expected one a second")
-    at_ns = start_ns - round(reference_offset_s(imu, truth) * NS_PER_S)  # in a turn half a second is degrees
-    start = truth.at(np.clip(np.array([at_ns]), truth.stamps_ns[0], truth.stamps_ns[-1]))
+    start = truth.at(np.array([start_ns]))
     x, y, z = start.positions[0].tolist()
     yaw, pitch, roll = start.rotations().as_euler("ZYX")[0].tolist()
     calibration = Calibration(
@@ -144,8 +153,7 @@ def read_akit(dataset_dir: Path, trajectory: int) -> Sequence:
             "licence": "none stated; the authors ask to be cited",
             "truth": "navigation system computed from the same IMU and DVL: a reference, no independent truth",
             "time": "rows timed by their number (IMU 100 Hz, DVL and reference 1 Hz), DVL one second later; "
-            "poses of the reference are 0.4 to 0.5 s older (trajectories 1-4, 7) or newer (5, 6) than their time says; "
-            "the start is its pose at the time at which it turns as the gyros do",
+            f"the reference moved by {offset_s:+.3f} s, so that it turns when the gyros do",
             "imu": "y axes negated; forward-right-down turned to forward-left-up",
         },
     )

@@ -105,8 +105,12 @@ def test_the_start_is_where_a_reference_that_is_late_turns_as_the_gyros_do(tmp_p
         write("GT", [(t, 0.61, LATITUDE, 0, 0, 0, 0, 0, 0, heading(t + late_s)) for t in range(60)])
         yaw_rad = np.pi / 2 - read_akit(tmp_path, 2).calibration.start.rpy_rad[2]
         assert yaw_rad == pytest.approx(heading(1.0), abs=0.005), late_s
+        truth = read_akit(tmp_path, 2).truth
+        assert truth.stamps_ns[0] >= 0
+        moved_s = truth.stamps_ns[0] * 1e-9 - late_s
+        assert moved_s == pytest.approx(round(moved_s), abs=0.005)
     write("GT", [(t, 0.61, LATITUDE, 0, 0, 0, 0, 0, 0, heading(t + 2.0)) for t in range(60)])  # farther than tried
-    assert np.pi / 2 - read_akit(tmp_path, 2).calibration.start.rpy_rad[2] == pytest.approx(heading(3.0), abs=0.005)
+    assert read_akit(tmp_path, 2).truth.stamps_ns[0] == 0
 
 
 @pytest.mark.recording
@@ -115,8 +119,9 @@ def test_inspect_does_not_call_the_start_heading_wrong(unpacked, trajectory):
     sea = read_akit(next(unpacked("akit_1-7.tar.xz").rglob("Trajectory1")).parent, trajectory)
     offset = match_reference_to_imu(sea.imu, sea.truth, sea.calibration).offset
     assert not find_start_heading(sea, sea.truth, offset).acts
-    late = sea.truth.at(np.array([sea.start_ns])).rotations().as_euler("ZYX")[0, 0]
-    start = sea.calibration.start.model_copy(update={"rpy_rad": (0.0, 0.0, late)})
+    assert abs(offset.value) < 1e-3
+    half_later = sea.truth.at(np.array([sea.start_ns + 450_000_000])).rotations().as_euler("ZYX")[0, 0]
+    start = sea.calibration.start.model_copy(update={"rpy_rad": (0.0, 0.0, half_later)})
     spoilt = replace(sea, calibration=sea.calibration.model_copy(update={"start": start}))
     assert find_start_heading(spoilt, sea.truth, offset).acts == (trajectory != 7)  # which starts without turning
 
