@@ -73,10 +73,14 @@ class DeadReckoning:
         None before the first DVL stamp that IMU rows cover from both sides.
         """
         self._odometry.add(measurements.imu, measurements.dvl)
+        self._odometry.used_depths(measurements.depth)  # not used here, but judged and named as by every estimator
         if (detections := measurements.detections) is not None:
             ids = detections.most_probable()[0].tolist()
-            for stamp_ns, landmark_id in zip(detections.stamps_ns.tolist(), ids, strict=True):
-                self._journal.record(stamp_ns, landmark_id, Outcome.IGNORED)
+            outcomes = [
+                Outcome.IGNORED if is_sound else Outcome.UNSOUND for is_sound in detections.are_sound().tolist()
+            ]
+            for stamp_ns, landmark_id, outcome in zip(detections.stamps_ns.tolist(), ids, outcomes, strict=True):
+                self._journal.record(stamp_ns, landmark_id, outcome)
         end_ns = measurements.end_ns
         epoch_ns = self._odometry.start_by(end_ns) if self._epoch_ns is None else self._epoch_ns
         if epoch_ns is None or end_ns < epoch_ns:
@@ -102,11 +106,11 @@ class DeadReckoning:
         return LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
 
     def detections(self) -> DetectionLog:
-        """Every detection, ignored."""
+        """Every detection, ignored or unsound."""
         return self._journal.log()
 
     def refused_rows(self) -> list[RefusedRow]:
-        """Rows of IMU and Doppler log that are not used, with the reason."""
+        """Rows of IMU, Doppler log and depth that are not used, with the reason."""
         return self._odometry.refused
 
     def _attitude(self) -> Floats:

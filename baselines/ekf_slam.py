@@ -132,18 +132,8 @@ class EkfSlam(FilterShell):
         EstimatorError
             When the pitch comes so near 90 degrees that the Euler angles are singular.
         """
-        k = advance(
-            self._x,
-            self._P,
-            self.turned,
-            self.impulse,
-            self.earth,
-            self.port,
-            self.depth_variance,
-            *self.sonar[:3],
-            events,
-            k,
-        )
+        state = self._x, self._P, self.turned, self.impulse
+        k = advance(*state, self.earth, self.port, self.depth_variance, *self.sonar[:3], events, k)
         if math.cos(self._x[4]) < SINGULAR_COSINE:
             raise EstimatorError(
                 f"ekf-slam: pitch is {math.degrees(self._x[4]):.2f} deg at {events.start_ns[k]} ns, where the Euler"

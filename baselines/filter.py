@@ -25,7 +25,7 @@ from pydantic import Field
 
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
 from sonar_graph.errors import EstimatorError
-from sonar_graph.measurements import Floats, Ints, LandmarkDetections, Measurements
+from sonar_graph.measurements import Depth, Floats, Ints, LandmarkDetections, Measurements
 from sonar_graph.motion import Motions, MotionSource, require_source
 from sonar_graph.navigation.alignment import earth_rate_in_world, tilt_sigma, up_direction
 from sonar_graph.numerics import I3, LOWER_LEFT, ZERO, compiled, cross, exp_and_mean, mat, store, vec
@@ -416,6 +416,7 @@ class FilterShell(ABC):
         """
         end_ns, detections = measurements.end_ns, measurements.detections
         self.odometry.add(measurements.imu, measurements.dvl)
+        depth = self.odometry.used_depths(measurements.depth)
         if self._reached_ns == NOT_STARTED:
             self._start(end_ns)
         since_ns, self._done_ns = max(self._done_ns, self._reached_ns), max(self._done_ns, end_ns)
@@ -423,7 +424,7 @@ class FilterShell(ABC):
         estimate = None
         if end_ns >= max(self._reached_ns, self.node_ns):
             try:
-                estimate = self._use(measurements, since_ns, ids, views)
+                estimate = self._use(end_ns, depth, since_ns, ids, views)
             except np.linalg.LinAlgError as error:
                 raise EstimatorError(
                     f"{self.name}: between {self.node_ns} and {end_ns} ns the expected covariance of a measurement is"
@@ -453,7 +454,7 @@ class FilterShell(ABC):
         return self._journal.log()
 
     def refused_rows(self) -> list[RefusedRow]:
-        """Rows of IMU and Doppler log that are not used, with the reason."""
+        """Rows of IMU, Doppler log and depth that are not used, with the reason."""
         return self.odometry.refused
 
     # ---------------------------------------------------------------- events
@@ -484,9 +485,9 @@ class FilterShell(ABC):
         e, S = np.full((n, 2), math.nan), np.full((n, 2, 2), math.nan)
         return ids, Views(stamps_ns, landmark, z, R_z, outcome, e, S)
 
-    def _use(self, measurements: Measurements, since_ns: int, ids: Ints, views: Views) -> Estimate:
+    def _use(self, end_ns: int, depth: Depth | None, since_ns: int, ids: Ints, views: Views) -> Estimate:
         """Carry the state to the newest epoch reached at the end of the call, with all measurements on the way."""
-        events = self._events(measurements, since_ns, views)
+        events = self._events(end_ns, depth, since_ns, views)
         kinds, k = events.kind.tolist(), 0
         while kinds[k] != END:
             if kinds[k] == PLANE and self._plane is not None:
@@ -510,11 +511,10 @@ class FilterShell(ABC):
         if self.node_ns > self._kept_ns + KEPT_NS:
             self.odometry.forget_before(self.node_ns)
             self._kept_ns = self.node_ns
-        return Estimate(measurements.end_ns, gtsam.Pose3(gtsam.Rot3(R), X), covariance)
+        return Estimate(end_ns, gtsam.Pose3(gtsam.Rot3(R), X), covariance)
 
-    def _events(self, measurements: Measurements, since_ns: int, views: Views) -> Events:
+    def _events(self, end_ns: int, depth: Depth | None, since_ns: int, views: Views) -> Events:
         """What happens up to the end of a call, from the state's epoch on."""
-        end_ns, depth = measurements.end_ns, measurements.depth
         epochs_ns, reached_ns = self.odometry.epochs_reached(self.node_ns, end_ns)
         depth_ns, z_m, variance_m2 = NO_STAMPS, NO_DEPTH, NO_DEPTH
         if depth is not None:

@@ -72,7 +72,7 @@ class Estimator(Protocol):
 
 @runtime_checkable
 class TellsRefusedRows(Protocol):
-    """Optional part of the contract: an estimator that names the rows of IMU and Doppler log that it does not use."""
+    """Optional part of the contract: an estimator that names the rows of IMU, Doppler log and depth not used."""
 
     def refused_rows(self) -> list[RefusedRow]:
         """Refused rows so far."""

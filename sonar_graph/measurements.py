@@ -287,6 +287,13 @@ class LandmarkDetections(Block):
         for first, last in pairwise(edges):
             yield self.rows(slice(first, last))
 
+    def are_sound(self) -> NDArray[np.bool_]:
+        """Mask, shape (n,), of rows with a possible range, and a positive definite covariance or none (NaN)."""
+        a, b, c, d = self.range_azimuth_cov.reshape(-1, 4).T
+        with np.errstate(all="ignore"):
+            is_definite = (a > 0) & (a * d - b * c > ROUNDING * a * d) & (np.abs(b - c) <= ROUNDING * np.sqrt(a * d))
+        return possible_ranges(self.range_m) & (is_definite | np.isnan(self.range_azimuth_cov).any(axis=(1, 2)))
+
     def most_probable(self) -> tuple[Ints, Floats]:
         """Identity with the highest posterior, and that posterior, shapes (n,) and (n,)."""
         row, best = np.arange(len(self)), self.id_probability.argmax(axis=1)

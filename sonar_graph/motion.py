@@ -19,7 +19,7 @@ import gtsam
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import CalibrationError
-from sonar_graph.measurements import Dvl, Floats, Imu, Ints
+from sonar_graph.measurements import Depth, Dvl, Floats, Imu, Ints
 from sonar_graph.states import RefusedRow
 
 
@@ -110,6 +110,9 @@ class MotionSource(Protocol):
 
     def add(self, imu: Imu | None, dvl: Dvl | None) -> bool:
         """Take in rows; True where some were placed before others: provisional motions are out of date."""
+
+    def used_depths(self, depth: Depth | None) -> Depth | None:
+        """Depth samples that a vehicle can have measured, None without any; the others are `refused`."""
 
     def start_by(self, until_ns: int) -> int | None:
         """First epoch, if it is reached at an instant; else None."""

@@ -1,7 +1,10 @@
 """A recorded or simulated run: produced by logs and simulator, consumed by estimators."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -20,7 +23,10 @@ from sonar_graph.measurements import (
     Measurements,
     PositionFixes,
 )
-from sonar_graph.states import LandmarkMap, Trajectory
+from sonar_graph.states import LandmarkMap, Refusal, RefusedRow, Trajectory
+
+PAUSE_NS = 86_400 * NS_PER_S
+"""A day. No log pauses so long: between rows farther apart a clock was set, and the part with more rows counts."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -72,15 +78,25 @@ class Sequence:
         """The truth, where it has orientations and not only positions."""
         return self.truth if self.truth is not None and self.truth.has_orientation else None
 
-    @property
+    @cached_property
     def start_ns(self) -> int:
         """First instant with IMU and DVL: the start pose of the calibration holds here."""
-        return int(max(self.imu.stamps_ns[0], self.dvl.stamps_ns[0]))
+        return max(_longest_part(self.imu.stamps_ns)[0], _longest_part(self.dvl.stamps_ns)[0])
 
-    @property
+    @cached_property
     def end_ns(self) -> int:
         """Last instant with IMU and DVL."""
-        return int(min(self.imu.stamps_ns[-1], self.dvl.stamps_ns[-1]))
+        return min(_longest_part(self.imu.stamps_ns)[1], _longest_part(self.dvl.stamps_ns)[1])
+
+    def off_the_clock(self) -> list[RefusedRow]:
+        """Rows more than a day before the start or after the end, which `replay` leaves out."""
+        first_ns, last_ns = self.start_ns - PAUSE_NS, self.end_ns + PAUSE_NS
+        return [
+            RefusedRow(sensor, stamp_ns, Refusal.CLOCK, math.nan)
+            for sensor, block in self.blocks().items()
+            if block.stamps_ns[0] <= first_ns or block.stamps_ns[-1] > last_ns
+            for stamp_ns in block.stamps_ns[(block.stamps_ns <= first_ns) | (block.stamps_ns > last_ns)].tolist()
+        ]
 
     @property
     def duration_s(self) -> float:
@@ -108,12 +124,19 @@ class Sequence:
         return instants
 
     def replay(self, instants_ns: Ints) -> Iterator[Measurements]:
-        """Measurements between successive instants; the first item holds everything up to the first instant."""
-        after_ns = np.iinfo(np.int64).min
+        """Measurements between successive instants; the first item holds all from a day before the start on."""
+        after_ns = self.start_ns - PAUSE_NS
         for end_ns in instants_ns.tolist():
             rows: dict[str, Any] = {name: block.between(after_ns, end_ns) for name, block in self.blocks().items()}
             yield Measurements(end_ns, **rows)
             after_ns = end_ns
+
+
+def _longest_part(stamps_ns: Ints) -> tuple[int, int]:
+    """First and last stamp of the part with the most rows between pauses."""
+    pauses = np.flatnonzero(np.diff(stamps_ns.astype(np.float64)) > PAUSE_NS) + 1
+    first, end = max(pairwise([0, *pauses.tolist(), len(stamps_ns)]), key=lambda part: part[1] - part[0])
+    return int(stamps_ns[first]), int(stamps_ns[end - 1])
 
 
 def require_sequence(value: object, call: str) -> None:

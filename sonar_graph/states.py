@@ -245,6 +245,9 @@ class Refusal(StrEnum):
     WAITED = "not used: it came after a gap, and only the velocity that confirmed it was"
     UNSOUND = "refused: its covariance is not positive definite"
     INCOMPLETE = "refused: too few beams, and nothing to complete them with"
+    BEYOND_SENSOR = "refused: no gyro or accelerometer measures this"
+    OUT_OF_REACH = "refused: no vehicle reaches this depth from the last, or no other depth confirms it"
+    CLOCK = "refused: more than a day from the rows that follow or precede; was the clock set between?"
 
 
 class RefusedRow(NamedTuple):
@@ -255,7 +258,7 @@ class RefusedRow(NamedTuple):
     stamp_ns: int
     reason: Refusal
     distance: float
-    """Squared Mahalanobis distance of an outlier, NaN for other reasons."""
+    """Squared Mahalanobis distance of an outlier, or of a depth out of reach; NaN for other reasons."""
 
 
 class DetectionJournal:

@@ -22,7 +22,7 @@ from sonar_graph.evaluation.results import MapSoFar, RunResult
 from sonar_graph.evaluation.scored_instants import map_instants
 from sonar_graph.measurements import Floats, Ints, LandmarkDetections, Measurements
 from sonar_graph.sequence import Sequence, require_sequence
-from sonar_graph.states import Estimate, LandmarkMap, Trajectory
+from sonar_graph.states import Estimate, LandmarkMap, RefusedRow, Trajectory
 
 Flags = NDArray[np.bool_]
 LOG = logging.getLogger(__name__)
@@ -221,7 +221,7 @@ class _Replay:
             told: dict[str, Any] = {}  # rows refused before are often why it failed
             if estimator is not None:
                 with contextlib.suppress(Exception):
-                    told["refused"] = refused_rows_of(estimator)
+                    told["refused"] = self._refused(estimator)
                 with contextlib.suppress(Exception):
                     told["withheld"] = withheld_of(estimator)
             reason = f"{self._stage}: {one_line(error)}"
@@ -285,12 +285,16 @@ class _Replay:
             smoothed=smoothed,
             landmarks=landmarks,
             detections=detections,
-            refused=refused_rows_of(estimator),
+            refused=self._refused(estimator),
             withheld=withheld_of(estimator),
             maps=self._maps,
             finish_s=finish_s,
             peak_memory_mb=peak_memory_mb,
         )
+
+    def _refused(self, estimator: Estimator) -> list[RefusedRow]:
+        """Rows that the replay left out, and those that the estimator names."""
+        return [*self._sequence.off_the_clock(), *refused_rows_of(estimator)]
 
     def _result(self, status: Any, reason: str = "", **outcome: Any) -> RunResult:
         params = self._params.model_dump(mode="json")

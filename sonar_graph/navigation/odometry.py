@@ -23,7 +23,7 @@ import numpy as np
 
 from sonar_graph.calibration import ROWS_BEFORE, Calibration
 from sonar_graph.errors import MeasurementError
-from sonar_graph.measurements import Dvl, Floats, Imu, Ints
+from sonar_graph.measurements import Depth, Dvl, Floats, Imu, Ints
 from sonar_graph.motion import Motions, PreintegratedMotion
 from sonar_graph.navigation.alignment import earth_rate_in_world
 from sonar_graph.navigation.dvl_gaps import Sensors, Stretch, bridge, continued, motion_over, remaining_motion
@@ -33,6 +33,7 @@ from sonar_graph.navigation.samples import WINDOW_NS, finite_vector, no_doppler_
 from sonar_graph.navigation.steps import Rows, rows_until
 from sonar_graph.navigation.sums import motions_over
 from sonar_graph.numerics import compiled
+from sonar_graph.sequence import PAUSE_NS
 from sonar_graph.states import RefusedRow
 
 ZERO = np.zeros(3)
@@ -108,6 +109,10 @@ class Odometry:
             self._kept = None
         return placed_imu or placed_dvl
 
+    def used_depths(self, depth: Depth | None) -> Depth | None:
+        """Depth samples that a vehicle can have measured, each stamp once, None without any; others go to `refused`."""
+        return None if depth is None else self._intake.used_depths(depth)
+
     def settle(self, epoch_ns: int) -> None:
         """Declare the motion up to an epoch as used: rows stamped at or before it are late from now on."""
         self._intake.settled_ns = max(self._intake.settled_ns, epoch_ns)
@@ -125,6 +130,9 @@ class Odometry:
         first = dvl_ns[np.searchsorted(dvl_ns, imu_ns[0]) :] if len(imu_ns) else dvl_ns[:0]
         if not len(first) or first[0] > imu_ns[-1]:
             return None
+        if first[0] - imu_ns[0] > PAUSE_NS:
+            self._intake.refuse_imu_before(int(first[0]) - PAUSE_NS)
+            return self.start_by(until_ns)
         return int(first[0]) if self.reached_ns(int(first[0])) <= until_ns else None
 
     def epochs(self, after_ns: int, until_ns: int) -> Ints:

@@ -14,7 +14,7 @@ import numpy as np
 
 from sonar_graph.measurements import NO_TRACK, LandmarkDetections
 from sonar_graph.slam.estimates import Solution
-from sonar_graph.slam.keyframes import Keyframes, sound_detections
+from sonar_graph.slam.keyframes import Keyframes
 from sonar_graph.slam.landmarks import (
     AmendableJournal,
     AssociatedUnknown,
@@ -77,7 +77,7 @@ class Frontend:
         """Rows that may become sightings; all rows go to the journal."""
         if not self._uses_tracks:
             frame = replace(frame, track=np.full(len(frame), NO_TRACK))
-        stamp_ns, is_sound = int(frame.stamps_ns[0]), sound_detections(frame)
+        stamp_ns, is_sound = int(frame.stamps_ns[0]), frame.are_sound()
         refusals: list[Outcome | None] = [Outcome.UNSOUND] * len(frame)
         waits, kept = [False] * len(frame), np.flatnonzero(is_sound).tolist()
         if self._keyframes.newest_ns is None:

@@ -294,4 +294,4 @@ class Isam2:
 
     def refused_rows(self) -> list[RefusedRow]:
         """Rows of IMU, Doppler log and depth that are not used, and why."""
-        return self._keyframes.refused
+        return self._keyframes.odometry.refused

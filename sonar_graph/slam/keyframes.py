@@ -3,9 +3,6 @@
 A keyframe sits at an epoch of the odometry (a DVL stamp). One is due ``max_interval_s`` after the last, and sooner when
 landmarks are seen and the noise of the motion since then would blur them (docs/theory/isam2.md). The gyro bias is
 constant over stretches of ``bias_interval_s`` and walks between them.
-
-Rows that cannot be measurements are refused: variances not above zero, covariances not positive definite, impossible
-ranges. NaN is sound: the log does not know the noise, and the calibration does.
 """
 
 from bisect import bisect_left
@@ -15,29 +12,14 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, X
-from numpy.typing import NDArray
 from pydantic import Field
 
 from sonar_graph.calibration import Calibration, Section
-from sonar_graph.measurements import Depth, Dvl, Floats, Imu, LandmarkDetections, possible_ranges
+from sonar_graph.measurements import Depth, Dvl, Floats, Imu
 from sonar_graph.motion import MotionSource, PreintegratedMotion
 from sonar_graph.navigation.alignment import gravity_direction
 from sonar_graph.slam.models import factors
 from sonar_graph.slam.smoother import Changed, Smoother
-from sonar_graph.states import Refusal, RefusedRow
-
-ROUNDING = 1e-13
-"""Share of a determinant below which it is taken for zero."""
-Flags = NDArray[np.bool_]
-
-
-def sound_detections(frame: LandmarkDetections) -> Flags:
-    """Rows that a sonar can have measured, shape (n,)."""
-    a, b, c, d = frame.range_azimuth_cov.reshape(-1, 4).T
-    with np.errstate(all="ignore"):
-        is_definite = (a > 0) & (a * d - b * c > ROUNDING * a * d)
-    return possible_ranges(frame.range_m) & (is_definite | np.isnan(frame.range_azimuth_cov).any(axis=(1, 2)))
-
 
 S_PER_NS = 1e-9
 CARRIED_IN_GAP_NS = 300_000_000
@@ -79,7 +61,6 @@ class Keyframes:
         self._linearised: tuple[Floats, Floats] = np.zeros(3), np.eye(3)
         self._depths: list[Depth] = []
         self._told = 0
-        self._refused: list[RefusedRow] = []
 
     @property
     def newest_ns(self) -> int | None:
@@ -103,26 +84,11 @@ class Keyframes:
         return X(bisect_left(self.stamps_ns, self.stamps_ns[-1] - round(age_s / S_PER_NS)))
 
     def add(self, imu: Imu | None, dvl: Dvl | None, depth: Depth | None) -> None:
-        """Take in rows; refuse unsound depths, and those older than others that wait."""
-        if depth is not None:
-            is_sound = np.isnan(depth.variance_m2) | ((depth.variance_m2 > 0) & np.isfinite(depth.variance_m2))
-            unsound = depth.stamps_ns[~is_sound].tolist()
-            self._refused += [RefusedRow("depth", stamp_ns, Refusal.UNSOUND, np.nan) for stamp_ns in unsound]
-            depth = depth if not unsound else depth.rows(is_sound) if is_sound.any() else None
+        """Take in rows; the source of motion says which depths are used."""
         self.odometry.add(imu, dvl)
         self._latest = None
-        newest_ns = self._depths[-1].stamps_ns[-1] if self._depths else EARLIEST_NS
-        if depth is not None and depth.stamps_ns[0] <= newest_ns:
-            late = depth.stamps_ns[depth.stamps_ns < newest_ns]
-            self._refused += [RefusedRow("depth", stamp_ns, Refusal.LATE, np.nan) for stamp_ns in late.tolist()]
-            depth = depth.between(newest_ns, LATEST_NS)
-        if depth is not None:
+        if (depth := self.odometry.used_depths(depth)) is not None:
             self._depths.append(depth)
-
-    @property
-    def refused(self) -> list[RefusedRow]:
-        """Rows of IMU, Doppler log and depth that are not used, and why."""
-        return self.odometry.refused + self._refused
 
     def advance(self, until_ns: int) -> list[Changed]:
         """Set the keyframes that are due from epochs reached at an instant; the first starts the graph.

@@ -20,7 +20,6 @@ from sonar_graph.logs.reading import read_log
 from sonar_graph.logs.vehicle_setup import PartialCalibration
 from sonar_graph.logs.writing import write_log
 from sonar_graph.measurements import LandmarkDetections
-from sonar_graph.slam.keyframes import sound_detections
 
 from .conftest import T0_NS, Bench, chunk_indexes, flip, header
 
@@ -264,7 +263,7 @@ def test_a_covariance_is_told_of_where_estimators_refuse_it(cross: float) -> Non
     for variances in ((1.0, 1.0), (-1.0, -1.0), (0.0, 1.0), (np.inf, 1.0), (1.0, np.inf), (np.nan, 1.0)):
         cov = np.array([[[variances[0], cross], [cross, variances[1]]]])
         row = LandmarkDetections(np.array([5]), np.ones(1), np.zeros(1), cov, np.array([[1]]), np.array([[0.9]]))
-        assert bool(list(detection_warnings(row, 0, 9))) == (not sound_detections(row)[0])
+        assert bool(list(detection_warnings(row, 0, 9))) == (not row.are_sound()[0])
 
 
 # --- damage and windows ---------------------------------------------------------------------------------------------

@@ -20,12 +20,12 @@ from sonar_graph.calibration import (
     SonarCalibration,
     Start,
 )
-from sonar_graph.measurements import Depth, Dvl, Imu, LandmarkDetections
+from sonar_graph.measurements import Depth, Dvl, Imu
 from sonar_graph.navigation import Odometry, PreintegratedMotion
 from sonar_graph.navigation.alignment.gravity import earth_rate_in_world
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 from sonar_graph.slam import Isam2
-from sonar_graph.slam.keyframes import KeyframeParams, Keyframes, sound_detections, weights_at_end
+from sonar_graph.slam.keyframes import KeyframeParams, Keyframes, weights_at_end
 from tests.navigation.rows import NS, T0_NS, dvl, imu, stamps
 
 from .graphs import factors_of
@@ -414,27 +414,6 @@ def test_depths_too_long_before_the_end_of_a_gap_leave_the_factor_of_the_others(
     (error, factor), (expected, alone) = found[1], found[0]
     assert error == pytest.approx(expected, abs=1e-12)
     assert factor.noiseModel().sigmas() == pytest.approx(alone.noiseModel().sigmas())
-
-
-def test_sound_detections_have_covariances_whose_eigenvalues_are_above_zero():
-    rng = np.random.default_rng(2)
-    roots = rng.normal(size=(2000, 2, 2))
-    covs = roots @ roots.transpose(0, 2, 1) - rng.uniform(0, 1, 2000)[:, None, None] * np.eye(2)
-    covs *= 10.0 ** rng.uniform(-8, 8, 2000)[:, None, None]
-    unusable = [
-        np.diag([np.inf, 1.0]),
-        np.diag([1.0, -np.inf]),
-        [[1.0, np.inf], [np.inf, 1.0]],
-        [[0.0, 0.0], [0.0, 1.0]],
-    ]
-    covs = np.concatenate([covs, unusable, np.full((1, 2, 2), np.nan)])
-    n = len(covs)
-    frame = LandmarkDetections(
-        np.zeros(n, np.int64), np.ones(n), np.zeros(n), covs, np.zeros((n, 1), np.int64), np.ones((n, 1))
-    )
-    expected = np.linalg.eigvalsh(covs[:2000])[:, 0] > 0
-    assert 200 < expected.sum() < 1800
-    assert np.array_equal(sound_detections(frame), [*expected, *[False] * len(unusable), True])
 
 
 @given(st.lists(st.tuples(st.floats(1e-9, 1e-2), st.floats(1e-5, 1e-2)), min_size=1, max_size=12))

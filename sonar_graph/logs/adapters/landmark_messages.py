@@ -257,14 +257,10 @@ def detection_warnings(detections: LandmarkDetections, first_ns: int, last_ns: i
 
     The odometry lasts from ``first_ns`` to ``last_ns``.
     """
-    covs = detections.range_azimuth_cov
-    a, b, c = covs[:, 0, 0], covs[:, 1, 0], covs[:, 1, 1]
-    unknown, finite = np.isnan(covs).any(axis=(1, 2)), np.isfinite(covs).all(axis=(1, 2))
-    with np.errstate(invalid="ignore", over="ignore"):
-        definite = finite & (a > 0) & (c > 0) & (a * c > b * b)
+    is_possible = possible_ranges(detections.range_m)
     faults = {
-        "a range that is not above 0 and at most 100 km": ~possible_ranges(detections.range_m),
-        "a covariance that is not positive definite": ~unknown & ~definite,
+        "a range that is not above 0 and at most 100 km": ~is_possible,
+        "a covariance that is not positive definite": is_possible & ~detections.are_sound(),
         "a stamp before the first odometry": detections.stamps_ns < first_ns,
         "a stamp after the last odometry": detections.stamps_ns > last_ns,
     }

@@ -16,8 +16,9 @@ stretch and, for a speed v of its last row, at least::
 
 The other rows up to its end are outliers. This assumes that of the waiting rows more are right than agree in being
 wrong. The first row stays the first epoch even where its velocity was wrong: it then has that of the first accepted
-row, with the variance of what may have changed since. Of a chain that ends a gap the last row alone is used. Waiting
-rows are no epochs. Stamps decide, not how a log is cut. docs/theory/gaps.md.
+row, with the variance of what may have changed since. Of a chain that ends a gap the last row alone is used. Rows
+more than a day apart confirm nothing. Waiting rows are no epochs. Stamps decide, not how a log is cut.
+docs/theory/gaps.md.
 """
 
 from typing import NamedTuple
@@ -31,6 +32,7 @@ from sonar_graph.navigation.samples import LATEST_NS, PARTIAL_M2_S2
 from sonar_graph.navigation.steps import covariance, rows_until
 from sonar_graph.navigation.steps import row as row_of
 from sonar_graph.numerics import O3, ZERO, Mat3, Vec3, compiled, inlined
+from sonar_graph.sequence import PAUSE_NS
 from sonar_graph.states import Refusal, RefusedRow
 
 Flags = NDArray[np.bool_]
@@ -183,6 +185,10 @@ class VelocityConfirmation:
             RefusedRow("dvl", old.stamp_ns, Refusal.UNCONFIRMED, np.nan) for old in self._waiting[:-MOST_WAITING]
         ]
         self._waiting = self._waiting[-MOST_WAITING:]
+        newest_ns = self._waiting[-1].stamp_ns
+        apart = [old.stamp_ns for old in self._waiting if newest_ns - old.stamp_ns > PAUSE_NS]
+        refused += [RefusedRow("dvl", old_ns, Refusal.CLOCK, np.nan) for old_ns in apart]
+        self._waiting = self._waiting[len(apart) :]
         chain = self.first_accepted_chain()
         return Confirmed(_columns(self.release(chain, refused) if chain else []), refused)
 

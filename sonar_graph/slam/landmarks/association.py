@@ -13,16 +13,17 @@ from sonar_graph.states import OUTCOME_NUMBERS, Outcome
 ACCEPTED = -1
 """In place of an outcome."""
 NO_IDENTITY, REPEATED = OUTCOME_NUMBERS[Outcome.NO_IDENTITY], OUTCOME_NUMBERS[Outcome.REPEATED]
+UNSOUND = OUTCOME_NUMBERS[Outcome.UNSOUND]
 
 
 def identify(detections: LandmarkDetections, minimum_probability: float) -> tuple[Ints, NDArray[np.int8]]:
     """Most probable identity of each row, shape (n,), and `ACCEPTED` or the `OUTCOME_NUMBERS` of its refusal, (n,).
 
-    Refused is a posterior that is too low or NaN, or of no identity (-1). A landmark is in one place: of several rows
-    of one frame with one identity the most probable is accepted, the first of equals.
+    Refused is an unsound row, and a posterior that is too low or NaN, or of no identity (-1). A landmark is in one
+    place: of several rows of one frame with one identity the most probable is accepted, the first of equals.
     """
-    n = len(detections)
-    ids, outcomes = np.empty(n, np.int64), np.empty(n, np.int8)
+    ids, outcomes = np.empty(len(detections), np.int64), np.full(len(detections), ACCEPTED, np.int8)
+    outcomes[~detections.are_sound()] = UNSOUND
     rows = detections.stamps_ns, detections.candidate_ids, detections.id_probability
     _write_identities(*rows, minimum_probability, ids, outcomes)
     return ids, outcomes
@@ -32,7 +33,7 @@ def identify(detections: LandmarkDetections, minimum_probability: float) -> tupl
 def _write_identities(
     stamps_ns: Ints, candidates: Ints, posterior: Floats, minimum: float, ids: Ints, outcomes: NDArray[np.int8]
 ) -> None:
-    """Fill what `identify` returns."""
+    """Fill what `identify` returns; outcomes other than `ACCEPTED` stay."""
     p = np.empty(len(ids))
     for row in range(len(ids)):
         best = 0
@@ -40,7 +41,8 @@ def _write_identities(
             if posterior[row, k] > posterior[row, best]:
                 best = k
         ids[row], p[row] = candidates[row, best], posterior[row, best]
-        outcomes[row] = ACCEPTED if p[row] >= minimum and ids[row] >= 0 else NO_IDENTITY
+        if outcomes[row] == ACCEPTED and not (p[row] >= minimum and ids[row] >= 0):
+            outcomes[row] = NO_IDENTITY
         other = row - 1
         while other >= 0 and stamps_ns[other] == stamps_ns[row]:
             if ids[other] == ids[row] and outcomes[other] == ACCEPTED and outcomes[row] == ACCEPTED:
