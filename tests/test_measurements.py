@@ -212,6 +212,21 @@ def test_a_range_is_above_zero_and_at_most_100_km():
     assert not possible_ranges(np.array([0.0, -1.0, np.nextafter(100_000.0, np.inf), np.inf, np.nan])).any()
 
 
+@given(st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4), st.integers(-80, 80), st.integers(-80, 80))
+def test_a_detection_is_sound_where_its_covariance_has_eigenvalues_above_zero(root, i, j):
+    for more in (0.1, -0.1):
+        A = np.reshape(root, (2, 2))
+        cov = A @ A.T + more * np.eye(2)
+        least = np.linalg.eigvalsh(cov)[0]
+        scale = np.diag([10.0**i, 10.0**j])
+        assert np.abs(least) < 1e-3 or bool(seen(range_azimuth_cov=[scale @ cov @ scale] * 2).are_sound()[0]) == (
+            least > 0
+        )
+    assert seen(range_azimuth_cov=np.full((2, 2, 2), np.nan)).are_sound().all()
+    for wrong in ([[1.0, 0.1], [0.2, 1.0]], [[np.inf, 0.0], [0.0, 1.0]], [[1.0, -np.inf], [np.inf, 1.0]]):
+        assert not seen(range_azimuth_cov=[wrong, np.eye(2)]).are_sound()[0]
+
+
 def test_posteriors_that_were_rounded_to_single_precision_still_are():
     exact = np.random.default_rng(1).dirichlet(np.ones(20), 1000)
     assert not no_posterior(exact.astype(np.float32).astype(np.float64)).any()

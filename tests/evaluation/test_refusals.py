@@ -15,7 +15,7 @@ from mcap.writer import Writer
 
 from sonar_graph.cli.main import main
 from sonar_graph.estimator import installed_estimators, load_estimator, refused_rows_of
-from sonar_graph.evaluation.results import MOST_ROWS_NAMED, gathered
+from sonar_graph.evaluation.results import MOST_ROWS_NAMED, RunResult, gathered
 from sonar_graph.evaluation.run import run_estimator
 from sonar_graph.evaluation.storage import read_comparison, write_comparison
 from sonar_graph.logs.writing import write_log
@@ -24,7 +24,7 @@ from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 from sonar_graph.slam.landmarks.sighting import SightingFactors
-from sonar_graph.states import Estimate, Refusal, RefusedRow
+from sonar_graph.states import Estimate, Outcome, Refusal, RefusedRow
 from tests.synthetic import late, outlier, refusing, with_run
 
 from .conftest import straight_sequence
@@ -94,6 +94,128 @@ def test_outliers_are_named_and_not_used(straight, name):
     assert min(row.distance for row in run.refused) > 44.8
     assert not clean.refused
     assert run.causal.positions == pytest.approx(clean.causal.positions, abs=1e-9)
+
+
+@pytest.fixture(scope="module")
+def mission() -> Sequence:
+    return simulate_mission(MissionOptions(duration_s=20.0))
+
+
+def changed(sequence: Sequence, sensor: str, column: str, rows: list[int], value: Any) -> Sequence:
+    """Some rows of a column have another value."""
+    block = getattr(sequence, sensor)
+    values = getattr(block, column).copy()
+    values[rows] = value
+    return replace(sequence, **{sensor: replace(block, **{column: values})})
+
+
+def without(sequence: Sequence, sensor: str, rows: list[int]) -> Sequence:
+    block = getattr(sequence, sensor)
+    return replace(sequence, **{sensor: block.rows(np.delete(np.arange(len(block)), rows))})
+
+
+def assert_same_numbers(one: RunResult, other: RunResult) -> None:
+    assert (one.status, other.status) == ("ok", "ok")
+    for part in ("positions", "quaternions_xyzw", "covariances"):
+        np.testing.assert_array_equal(getattr(one.causal, part), getattr(other.causal, part))
+        np.testing.assert_array_equal(getattr(one.smoothed, part), getattr(other.smoothed, part))
+    np.testing.assert_array_equal(one.landmarks.positions, other.landmarks.positions)
+
+
+BAD_ROWS = [
+    ("depth", "z_m", list(range(7, 150, 20)), -1000.0, Refusal.OUT_OF_REACH),
+    ("depth", "z_m", [40], 100.0, Refusal.OUT_OF_REACH),
+    ("depth", "z_m", [0, 1], -1000.0, Refusal.OUT_OF_REACH),
+    ("depth", "variance_m2", [40], -1.0, Refusal.UNSOUND),
+    ("imu", "angular_velocity", [900], 1e9, Refusal.BEYOND_SENSOR),
+    ("imu", "angular_velocity", [0, 900], -36.0, Refusal.BEYOND_SENSOR),
+    ("imu", "specific_force", [900], -1e9, Refusal.BEYOND_SENSOR),
+    ("imu", "specific_force", [900], np.inf, Refusal.BEYOND_SENSOR),
+]
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+@pytest.mark.parametrize(("sensor", "column", "rows", "value", "reason"), BAD_ROWS)
+def test_rows_that_no_sensor_or_vehicle_gives_are_named_and_change_nothing(
+    mission, name, sensor, column, rows, value, reason
+):
+    faulty = run_estimator(changed(mission, sensor, column, rows, value), name)
+    known = run_estimator(without(mission, sensor, rows), name, instants_ns=mission.instants(2.0))
+    assert_same_numbers(faulty, known)
+    stamps_ns = getattr(mission, sensor).stamps_ns[rows]
+    assert [(row.sensor, row.stamp_ns, row.reason) for row in faulty.refused] == [
+        (sensor, stamp_ns, reason) for stamp_ns in stamps_ns
+    ]
+    assert all((row.distance > 37.3) == (reason is Refusal.OUT_OF_REACH) for row in faulty.refused)
+    assert not known.refused
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_an_unsound_detection_is_named_and_changes_nothing(mission, name):
+    for column, value in (("range_azimuth_cov", [[1e-4, 1e-2], [1e-2, 1e-4]]), ("range_m", -3.0)):
+        faulty = run_estimator(changed(mission, "detections", column, [9], value), name)
+        known = run_estimator(without(mission, "detections", [9]), name)
+        assert_same_numbers(faulty, known)
+        outcomes = faulty.detections.outcomes
+        assert [row for row, outcome in enumerate(outcomes) if outcome is Outcome.UNSOUND] == [9]
+        assert outcomes[:9] + outcomes[10:] == known.detections.outcomes
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_rows_that_a_sensor_and_a_vehicle_can_give_are_used(mission, name):
+    """The control: half a metre more of depth, and quick turns and knocks, change what comes out."""
+    clean = run_estimator(mission, name)
+    sensors = [("imu", "angular_velocity", [900], 3.0), ("depth", "z_m", [40], mission.depth.z_m[40] + 0.5)]
+    for change in sensors if name != "dead-reckoning" else sensors[:1]:
+        run = run_estimator(changed(mission, *change), name)
+        assert not run.refused
+        assert not np.array_equal(run.causal.positions, clean.causal.positions)
+
+
+def off_the_clock(sequence: Sequence, rows: int, step_ns: int) -> Sequence:
+    """The first rows of each sensor are stamped from zero on."""
+    blocks = {}
+    for sensor in ("imu", "dvl", "depth", "detections"):
+        block = getattr(sequence, sensor)
+        blocks[sensor] = replace(block, stamps_ns=np.r_[np.arange(rows) * step_ns, block.stamps_ns[rows:]])
+    return replace(sequence, **blocks)
+
+
+def begun_at(sequence: Sequence, rows: int) -> Sequence:
+    for sensor in ("imu", "dvl", "depth", "detections"):
+        sequence = without(sequence, sensor, list(range(rows)))
+    return sequence
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+@pytest.mark.parametrize(("rows", "step_ns"), [(1, 0), (3, 0), (5, NS // 10)])
+def test_first_rows_before_the_clock_was_set_are_named_and_change_nothing(mission, name, rows, step_ns):
+    faulty, known = off_the_clock(mission, rows, step_ns), begun_at(mission, rows)
+    run = run_estimator(faulty, name)
+    assert_same_numbers(run, run_estimator(known, name))
+    assert Counter((row.sensor, row.reason) for row in run.refused) == {
+        (sensor, Refusal.CLOCK): rows for sensor in ("imu", "dvl", "depth", "detections")
+    }
+    assert np.array_equal(faulty.instants(2.0), known.instants(2.0))
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+@pytest.mark.parametrize("cuts_hz", [0.1, 3.0])
+def test_a_row_before_the_clock_was_set_starts_no_estimator_however_the_log_is_cut(mission, name, cuts_hz):
+    """A caller that gets rows as they come, and cannot know what follows."""
+    poses = []
+    for sequence in (off_the_clock(mission, 1, 0), begun_at(mission, 1)):
+        estimator = load_estimator(name)(sequence.calibration, Odometry(sequence.calibration))
+        if not sequence.imu.stamps_ns[0]:
+            first = (block.between(-1, 0) for block in (sequence.imu, sequence.dvl, sequence.depth))
+            assert estimator.process(Measurements(0, *first)) is None
+        for step in sequence.replay(sequence.instants(cuts_hz)):
+            estimator.process(step)
+        poses.append(estimator.trajectory())
+        told = {(row.sensor, row.stamp_ns, row.reason) for row in estimator.refused_rows()}
+        assert told == ({(s, 0, Refusal.CLOCK) for s in ("imu", "dvl")} if len(poses) == 1 else set())
+    np.testing.assert_array_equal(poses[0].positions, poses[1].positions)
+    np.testing.assert_array_equal(poses[0].stamps_ns, poses[1].stamps_ns)
 
 
 def live(name: str, sequence: Sequence, late: Measurements | None) -> tuple[Estimate | None, list[RefusedRow]]:

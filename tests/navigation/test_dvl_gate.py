@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from sonar_graph.calibration import Calibration
+from sonar_graph.calibration import Calibration, DepthCalibration, Start
 from sonar_graph.devices.dvl_beams import UNMEASURED_M_S
-from sonar_graph.measurements import Dvl
+from sonar_graph.measurements import Depth, Dvl
 from sonar_graph.navigation.dvl_screening.dvl_gate import (
     GATE,
     LONG_NS,
@@ -18,6 +18,7 @@ from sonar_graph.navigation.dvl_screening.dvl_gate import (
     gate_velocities,
     needed,
 )
+from sonar_graph.navigation.dvl_screening.row_intake import DEPTH_GATE, FEWEST, UNSAID_M, VERTICAL_M_S
 from sonar_graph.navigation.odometry import Odometry
 from sonar_graph.states import Refusal
 
@@ -276,3 +277,80 @@ def test_rows_of_few_beams_wait_with_the_first_whole_ones():
     odometry = told(Dvl(rows.stamps_ns, rows.velocity, cov))
     assert np.array_equal(odometry._rows()[3], rows.stamps_ns[1:])
     assert [(row.stamp_ns, row.reason) for row in odometry.refused] == [(rows.stamps_ns[0], Refusal.INCOMPLETE)]
+
+
+DEPTHS = Calibration(start=Start(position_m=(0.0, 0.0, -5.0)), depth=DepthCalibration(sigma_m=0.1))
+NOISE_M = np.sqrt(0.1**2 + 0.1**2 + UNSAID_M**2)
+
+
+def depths(seconds: list[float], z_m: list[float], variance_m2: float = np.nan) -> Depth:
+    return Depth(np.array([at(s) for s in seconds]), np.array(z_m), np.full(len(z_m), variance_m2))
+
+
+def used(seconds: list[float], z_m: list[float]) -> list[int]:
+    """Rows that are used; the others are named, and the same whether they come at once or one by one."""
+    rows, found = depths(seconds, z_m), []
+    whole, single = Odometry(DEPTHS), Odometry(DEPTHS)
+    for k in range(len(rows)):
+        found += [k] * (single.used_depths(rows.rows(slice(k, k + 1))) is not None)
+    kept = whole.used_depths(rows)
+    assert ([] if kept is None else kept.stamps_ns.tolist()) == rows.stamps_ns[found].tolist()
+    assert whole.refused == single.refused
+    refused_ns = np.delete(rows.stamps_ns, found).tolist()
+    assert [(row.sensor, row.stamp_ns, row.reason) for row in whole.refused] == [
+        ("depth", stamp_ns, Refusal.OUT_OF_REACH) for stamp_ns in refused_ns
+    ]
+    assert all(row.distance > DEPTH_GATE for row in whole.refused)
+    return found
+
+
+def test_a_depth_passes_as_far_as_a_vehicle_gets_and_its_noise_goes():
+    """``V t`` and the quantile of noise; chi2: once in a billion."""
+    assert chi2.sf(DEPTH_GATE, 1) == pytest.approx(1e-9, rel=0.02)
+    for seconds in (0.1, 1.0, 2.9):
+        edge_m = VERTICAL_M_S * seconds + np.sqrt(DEPTH_GATE) * NOISE_M
+        for sign in (1.0, -1.0):
+            assert used([0.0, seconds], [-5.0, -5.0 + sign * 0.999 * edge_m]) == [0, 1]
+            assert used([0.0, seconds], [-5.0, -5.0 + sign * 1.001 * edge_m]) == [0]
+
+
+def test_a_refused_depth_is_told_with_its_distance():
+    odometry = Odometry(DEPTHS)
+    odometry.used_depths(depths([0.0, 1.0], [-5.0, 95.0]))
+    (row,) = odometry.refused
+    assert row.distance == pytest.approx(((100.0 - VERTICAL_M_S) / NOISE_M) ** 2)
+
+
+def test_first_depths_far_from_the_start_are_used_when_enough_agree():
+    assert used([0.0], [-13.0]) == [0]
+    assert used([0.0, 1.0, 2.0, 3.0], [-50.0] * 4) == [FEWEST - 1, 3]
+    assert used([0.0, 1.0, 2.0, 3.0, 4.0], [-50.0, -900.0, -50.0, 300.0, -50.0]) == [4]
+
+
+def test_depths_after_a_long_gap_are_used_near_the_last_or_when_enough_agree():
+    seconds = [0.0, 0.2, 60.0, 61.0, 62.0, 63.0]
+    assert used(seconds, [-5.0, -5.0, -13.0, -13.0, -13.0, -13.0]) == [0, 1, 2, 3, 4, 5]
+    assert used(seconds, [-5.0, -5.0, -100.0, -5.0, -5.0, -5.0]) == [0, 1, 3, 4, 5]
+    assert used(seconds, [-5.0, -5.0, -100.0, -101.0, -102.0, -5.0]) == [0, 1, 4]
+    slow = np.arange(6) * 20.0  # its own interval is known from the third row on
+    assert used(slow.tolist(), (-5.0 - 1.5 * slow).tolist()) == [0, 2, 3, 4, 5]
+
+
+def test_a_chain_of_wrong_depths_is_overruled_by_a_longer_one():
+    seconds = (np.arange(12) * 0.2).tolist()
+    assert used(seconds, [-900.0] * 4 + [-5.0] * 8) == [2, 3, *range(8, 12)]
+    assert used(seconds, [-5.0] * 8 + [-900.0] * 4) == [*range(8)]
+
+
+def test_depths_are_in_order_each_stamp_once_and_sound():
+    odometry = Odometry(DEPTHS)
+    assert odometry.used_depths(depths([1.0, 1.0, 2.0], [-5.0, -6.0, -5.0])).z_m.tolist() == [-5.0, -5.0]
+    assert odometry.used_depths(depths([1.5], [-5.0])) is None
+    assert odometry.used_depths(depths([3.0], [-5.0], 0.0)) is None
+    assert odometry.used_depths(depths([4.0], [-5.0], np.inf)) is None
+    assert odometry.used_depths(None) is None
+    assert [(row.stamp_ns, row.reason) for row in odometry.refused] == [
+        (at(1.5), Refusal.LATE),
+        (at(3.0), Refusal.UNSOUND),
+        (at(4.0), Refusal.UNSOUND),
+    ]

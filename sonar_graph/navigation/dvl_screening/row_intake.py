@@ -85,14 +85,13 @@ class DepthGate:
         self._refused: list[DepthChain] = []
         self.newest_ns: int = EARLIEST_NS
         """Stamp of the last sample that was judged."""
-        self._interval_ns = LATEST_NS
+        self._interval_ns: int | None = None
 
     def distance(self, stamp_ns: int, z_m: float, variance_m2: float) -> float | None:
         """None for a sample that is used, else its squared distance from the last one used."""
+        longest_ns = max(LONG_NS, LONG_INTERVALS * (self._interval_ns or 0))
         if self.newest_ns > EARLIEST_NS:
-            self._interval_ns = min(self._interval_ns, stamp_ns - self.newest_ns)
-        is_slow = LONG_NS < LONG_INTERVALS * self._interval_ns < LATEST_NS
-        longest_ns = LONG_INTERVALS * self._interval_ns if is_slow else LONG_NS
+            self._interval_ns = min(self._interval_ns or LATEST_NS, stamp_ns - self.newest_ns)
         self.newest_ns, sample, used = stamp_ns, DepthChain(stamp_ns, z_m, variance_m2, 1), self._used
         distance = used.distance(sample, longest_ns)
         if distance <= DEPTH_GATE:
