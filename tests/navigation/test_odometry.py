@@ -199,20 +199,13 @@ def test_rows_that_are_missing_or_of_another_kind_are_named():
             odometry_of(*blocks).motion(1, 2, ZERO)
 
 
-def steady(seconds: float = 4.0, calibration: Calibration | None = None) -> Odometry:
-    """Ten IMU rows a second and two of the Doppler log: tenths of a second in rad/s, and their hundredth in m/s."""
-    quick, slow = stamps(10, seconds), stamps(2, seconds)
-    rate, velocity = (np.outer((t - T0_NS) / (NS / 10), [0, 0, 1.0]) for t in (quick, slow))
-    return odometry_of(imu(quick, rate), dvl(slow, 0.01 * velocity), calibration)
-
-
 @pytest.mark.parametrize(("calibration", "kept_s"), [(HELD, 0.0), (Calibration(), 5.0)], ids=["held", "linear"])
 def test_forgetting_drops_rows_of_both_sensors_that_no_motion_needs(calibration, kept_s):
     """A gap that opens later is bridged by a line through the five seconds before it; held velocities need one row.
 
     What counts as a hole of the IMU is told from some rows more.
     """
-    odometry = steady(20.0, calibration)
+    odometry = odometry_of(imu(stamps(10, 20.0), 0.0), dvl(stamps(2, 20.0), 0.0), calibration)
     odometry.forget_before(at(15.0))
     rows = odometry._rows()
     for stamps_ns, earliest_s in ((rows.imu_ns, 15.0 - ROWS_BEFORE / 10), (rows.dvl_ns, 14.5)):
@@ -222,7 +215,9 @@ def test_forgetting_drops_rows_of_both_sensors_that_no_motion_needs(calibration,
 
 def test_a_row_at_the_very_instant_is_used_and_none_after_it():
     """Rates are linear from 10 on and held after the newest row; so are velocities from 0.1 on."""
-    odometry = steady()
+    quick, slow = stamps(10, 3.0), stamps(2, 3.0)
+    rate, velocity = (np.outer((t - T0_NS) / (NS / 10), [0, 0, 1.0]) for t in (quick, slow))
+    odometry = odometry_of(imu(quick, rate), dvl(slow, 0.01 * velocity))
     for until_s, turn, way in ((1.2, 2.2, 0.02), (1.25, 2.2 + 0.6, 0.025), (1.5, 6.25, 0.0625)):
         found = odometry.motion(at(1.0), at(until_s), ZERO).i_T_j
         assert np.exp(1j * found.rotation().yaw()) == pytest.approx(np.exp(1j * turn))
