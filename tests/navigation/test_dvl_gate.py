@@ -340,6 +340,8 @@ def test_a_chain_of_wrong_depths_is_overruled_by_a_longer_one():
     seconds = (np.arange(12) * 0.2).tolist()
     assert used(seconds, [-900.0] * 4 + [-5.0] * 8) == [2, 3, *range(8, 12)]
     assert used(seconds, [-5.0] * 8 + [-900.0] * 4) == [*range(8)]
+    assert used(seconds, [-5.0, -900.0, -900.0] * 4) == [0, 3, 6, 9]
+    assert used([0.0, 1.0, 2.0, 10.0], [-100.0, -130.0, -130.0, -115.0]) == [3]
 
 
 def test_depths_are_in_order_each_stamp_once_and_sound():
