@@ -31,6 +31,9 @@ FARTHEST_M = 100_000.0
 UNMEASURED_M2 = 1e8
 """Variance of a coordinate that a position fix does not measure, such as a height: 10 km squared."""
 
+FULL_TURN_RAD = 2.0 * np.pi
+"""No azimuth lies beyond: half a turn to either side, or a turn where it is counted from 0 on."""
+
 
 def no_posterior(probability: Floats) -> NDArray[np.bool_]:
     """Mask, shape (n,), of rows of ``probability``, shape (n, k), that are below 0, NaN, or above 1 in sum."""
@@ -288,11 +291,12 @@ class LandmarkDetections(Block):
             yield self.rows(slice(first, last))
 
     def are_sound(self) -> NDArray[np.bool_]:
-        """Mask, shape (n,), of rows with a possible range, and a positive definite covariance or none (NaN)."""
+        """Mask, shape (n,), of rows with possible range and azimuth, and a positive definite or no covariance (NaN)."""
         a, b, c, d = self.range_azimuth_cov.reshape(-1, 4).T
         with np.errstate(all="ignore"):
             is_definite = (a > 0) & (a * d - b * c > ROUNDING * a * d) & (np.abs(b - c) <= ROUNDING * np.sqrt(a * d))
-        return possible_ranges(self.range_m) & (is_definite | np.isnan(self.range_azimuth_cov).any(axis=(1, 2)))
+        is_possible = possible_ranges(self.range_m) & (np.abs(self.azimuth_rad) <= FULL_TURN_RAD)
+        return is_possible & (is_definite | np.isnan(self.range_azimuth_cov).any(axis=(1, 2)))
 
     def most_probable(self) -> tuple[Ints, Floats]:
         """Identity with the highest posterior, and that posterior, shapes (n,) and (n,)."""

@@ -212,7 +212,12 @@ def test_a_range_is_above_zero_and_at_most_100_km():
     assert not possible_ranges(np.array([0.0, -1.0, np.nextafter(100_000.0, np.inf), np.inf, np.nan])).any()
 
 
-@given(st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4), st.integers(-80, 80), st.integers(-80, 80))
+def test_an_azimuth_lies_within_a_full_turn():
+    for azimuth, is_sound in ((-np.pi, True), (2 * np.pi, True), (-2 * np.pi, True), (6.3, False), (-40.0, False)):
+        assert seen(azimuth_rad=[azimuth, 0.0]).are_sound().tolist() == [is_sound, True]
+
+
+@given(st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4), st.integers(-70, 70), st.integers(-70, 70))
 def test_a_detection_is_sound_where_its_covariance_has_eigenvalues_above_zero(root, i, j):
     for more in (0.1, -0.1):
         A = np.reshape(root, (2, 2))

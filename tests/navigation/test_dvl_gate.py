@@ -287,10 +287,10 @@ def depths(seconds: list[float], z_m: list[float], variance_m2: float = np.nan) 
     return Depth(np.array([at(s) for s in seconds]), np.array(z_m), np.full(len(z_m), variance_m2))
 
 
-def used(seconds: list[float], z_m: list[float]) -> list[int]:
+def used(seconds: list[float], z_m: list[float], calibration: Calibration = DEPTHS) -> list[int]:
     """Rows that are used; the others are named, and the same whether they come at once or one by one."""
     rows, found = depths(seconds, z_m), []
-    whole, single = Odometry(DEPTHS), Odometry(DEPTHS)
+    whole, single = Odometry(calibration), Odometry(calibration)
     for k in range(len(rows)):
         found += [k] * (single.used_depths(rows.rows(slice(k, k + 1))) is not None)
     kept = whole.used_depths(rows)
@@ -321,10 +321,25 @@ def test_a_refused_depth_is_told_with_its_distance():
     assert row.distance == pytest.approx(((100.0 - VERTICAL_M_S) / NOISE_M) ** 2)
 
 
-def test_first_depths_far_from_the_start_are_used_when_enough_agree():
+UNSTATED = Calibration(depth=DepthCalibration(sigma_m=0.1))
+
+
+def test_first_depths_far_from_the_start_are_used_when_enough_agree_unless_it_is_stated():
     assert used([0.0], [-13.0]) == [0]
-    assert used([0.0, 1.0, 2.0, 3.0], [-50.0] * 4) == [FEWEST - 1, 3]
-    assert used([0.0, 1.0, 2.0, 3.0, 4.0], [-50.0, -900.0, -50.0, 300.0, -50.0]) == [4]
+    seconds, far = [0.0, 1.0, 2.0, 3.0], [-50.0] * 4
+    assert used(seconds, far, UNSTATED) == [FEWEST - 1, 3]
+    assert used(seconds, far) == []
+    assert used([*seconds, 4.0], [-50.0, -900.0, -50.0, 300.0, -50.0], UNSTATED) == [4]
+    assert used([*seconds, 4.0], [*far, -5.0]) == [4]
+
+
+def test_a_depth_that_hangs_stays_refused_and_the_first_right_ones_after_that_are_found_by_their_agreement():
+    seconds = np.arange(1000.0)
+    for calibration in (DEPTHS, UNSTATED):
+        assert used(seconds.tolist(), [-5.0] * 5 + [-900.0] * 5 + [-5.0] * 990, calibration)[4:6] == [4, 10]
+    hangs = np.where(seconds < 900.0, -900.0, -25.0)
+    hangs[:5] = -5.0
+    assert used(seconds.tolist(), hangs.tolist()) == [*range(5), *range(902, 1000)]
 
 
 def test_depths_after_a_long_gap_are_used_near_the_last_or_when_enough_agree():
@@ -338,10 +353,11 @@ def test_depths_after_a_long_gap_are_used_near_the_last_or_when_enough_agree():
 
 def test_a_chain_of_wrong_depths_is_overruled_by_a_longer_one():
     seconds = (np.arange(12) * 0.2).tolist()
-    assert used(seconds, [-900.0] * 4 + [-5.0] * 8) == [2, 3, *range(8, 12)]
-    assert used(seconds, [-5.0] * 8 + [-900.0] * 4) == [*range(8)]
-    assert used(seconds, [-5.0, -900.0, -900.0] * 4) == [0, 3, 6, 9]
-    assert used([0.0, 1.0, 2.0, 10.0], [-100.0, -130.0, -130.0, -115.0]) == [3]
+    assert used(seconds, [-900.0] * 4 + [-5.0] * 8, UNSTATED) == [2, 3, *range(8, 12)]
+    for calibration in (DEPTHS, UNSTATED):
+        assert used(seconds, [-5.0] * 8 + [-900.0] * 4, calibration) == [*range(8)]
+        assert used(seconds, [-5.0, -900.0, -900.0] * 4, calibration) == [0, 3, 6, 9]
+    assert used([0.0, 1.0, 2.0, 10.0], [-100.0, -130.0, -130.0, -115.0], UNSTATED) == [3]
 
 
 def test_depths_are_in_order_each_stamp_once_and_sound():

@@ -19,6 +19,7 @@ from sonar_graph.logs.cdr import Messages
 from sonar_graph.logs.mcap import Topic
 from sonar_graph.measurements import (
     FIRST_TOO_LARGE_ID,
+    FULL_TURN_RAD,
     ID_ADVICE,
     NO_TRACK,
     ROUNDING,
@@ -257,10 +258,11 @@ def detection_warnings(detections: LandmarkDetections, first_ns: int, last_ns: i
 
     The odometry lasts from ``first_ns`` to ``last_ns``.
     """
-    is_possible = possible_ranges(detections.range_m)
+    is_range, is_azimuth = possible_ranges(detections.range_m), np.abs(detections.azimuth_rad) <= FULL_TURN_RAD
     faults = {
-        "a range that is not above 0 and at most 100 km": ~is_possible,
-        "a covariance that is not positive definite": is_possible & ~detections.are_sound(),
+        "a range that is not above 0 and at most 100 km": ~is_range,
+        "an azimuth beyond a full turn (of radians; are they degrees?)": ~is_azimuth,
+        "a covariance that is not positive definite": is_range & is_azimuth & ~detections.are_sound(),
         "a stamp before the first odometry": detections.stamps_ns < first_ns,
         "a stamp after the last odometry": detections.stamps_ns > last_ns,
     }

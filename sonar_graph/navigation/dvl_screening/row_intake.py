@@ -13,9 +13,9 @@ sample of variance r from an earlier one of r_0, gated at `DEPTH_GATE`, with wha
 
 A sample is used if it is within the gate of the last one used, at the start of the calibration's pose, with t at most
 `LONG_NS` and `LONG_INTERVALS` of the log's own. Else it is refused, but forms a chain with refused ones that it can be
-reached from. A chain is used from its last sample on when it has `FEWEST` samples and can be reached from the last one
-used, or else has more than that one's chain. Nothing waits: a sample is judged by those stamped before it.
-docs/theory/gaps.md.
+reached from. A chain is used from its last sample on when it has `FEWEST` samples and its first could be reached from
+the last one used, or else has more than that one's chain. That of a start that the calibration states is never
+overruled. Nothing waits: a sample is judged by those stamped before it. docs/theory/gaps.md.
 
 A row is known from its own stamp on, one that waited from that of the row that completed or confirmed it. So what is
 known at an instant follows from stamps, not from the calls in which rows came.
@@ -67,6 +67,8 @@ class DepthChain(NamedTuple):
     z_m: float
     variance_m2: float
     length: int
+    is_reachable: bool = False
+    """True where a vehicle could get from the last sample used to the first of these."""
 
     def distance(self, to: "DepthChain", longest_ns: int = LATEST_NS) -> float:
         """Squared distance d of the module's equation, with t at most ``longest_ns``."""
@@ -80,8 +82,9 @@ class DepthGate:
 
     def __init__(self, calibration: Calibration) -> None:
         start, port_m = calibration.start, np.array(calibration.depth.port_m)
-        z_m = float(start.pose().transformFrom(port_m)[2])
-        self._used = DepthChain(EARLIEST_NS, z_m, start.position_sigma_m[2] ** 2, FEWEST - 1)
+        z_m, is_stated = float(start.pose().transformFrom(port_m)[2]), "position_m" in start.model_fields_set
+        length = LATEST_NS if is_stated else FEWEST - 1
+        self._used = DepthChain(EARLIEST_NS, z_m, start.position_sigma_m[2] ** 2, length)
         self._refused: list[DepthChain] = []
         self.newest_ns: int = EARLIEST_NS
         """Stamp of the last sample that was judged."""
@@ -92,6 +95,8 @@ class DepthGate:
         longest_ns = max(LONG_NS, LONG_INTERVALS * (self._interval_ns or 0))
         if self.newest_ns > EARLIEST_NS:
             self._interval_ns = min(self._interval_ns or LATEST_NS, stamp_ns - self.newest_ns)
+        else:
+            self._used = self._used._replace(stamp_ns=stamp_ns - LONG_NS)
         self.newest_ns, sample, used = stamp_ns, DepthChain(stamp_ns, z_m, variance_m2, 1), self._used
         distance = used.distance(sample, longest_ns)
         if distance <= DEPTH_GATE:
@@ -101,8 +106,10 @@ class DepthGate:
         if near:
             before = max(near, key=lambda chain: chain.length)
             self._refused.remove(before)
-            sample = sample._replace(length=before.length + 1)
-        if sample.length > (FEWEST - 1 if used.distance(sample) <= DEPTH_GATE else used.length):
+            sample = sample._replace(length=before.length + 1, is_reachable=before.is_reachable)
+        else:
+            sample = sample._replace(is_reachable=used.distance(sample) <= DEPTH_GATE)
+        if sample.length > (FEWEST - 1 if sample.is_reachable else used.length):
             self._used, self._refused = sample, []
             return None
         self._refused = [*self._refused, sample][-MOST_CHAINS:]
