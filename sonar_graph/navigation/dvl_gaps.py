@@ -13,13 +13,15 @@ Open: nothing stamped later is known. The line is fitted by least squares to the
 before the epoch: ``w_k = T (1 / n + (T / 2 - mean t) (t_k - mean t) / sum (t - mean t)^2)``.
 
 Walk: where a specific force was not measured, or too little precedes the epoch, the velocity is a random walk of root
-density q (m/s/√s) between its ends, ``q^2 T^3 / 12`` (closed), or from its last value on, ``q^2 T^3 / 3`` (open).
+density q (m/s/√s) between its ends, ``q^2 T^3 / 12`` (closed), or from its last value on, ``q^2 T^3 / 3`` (open). An
+open gap is a walk too once the accelerometers are less sure than that (`longest_open_s`).
 
 docs/theory/gaps.md.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -48,6 +50,8 @@ class Sensors(NamedTuple):
     accel_density: float
     accel_bias_sigma: float
     velocity_walk_density: float
+    longest_open_s: float
+    """Time since bottom lock after which the last velocity is worth more than accelerometers."""
     body_p_imu: Floats
     body_p_dvl: Floats
 
@@ -57,7 +61,20 @@ class Sensors(NamedTuple):
         imu, dvl = calibration.imu, calibration.dvl
         noise = imu.gyro_noise_density, imu.accel_noise_density, imu.accel_bias_sigma, dvl.velocity_walk_density
         places = np.array(imu.mounting.translation_m), np.array(dvl.mounting.translation_m)
-        return cls(longest_interval_ns(calibration), *noise, *places)
+        return cls(longest_interval_ns(calibration), *noise, longest_open_s(calibration), *places)
+
+
+def longest_open_s(calibration: Calibration) -> float:
+    """Time T after which an open gap's horizontal error by accelerometers exceeds that of the walk.
+
+    ``n_a^2 T^3 / 3 + g^2 n_g^2 T^5 / 20 + b^2 T^4 / 4 = q^2 T^3 / 3``, of a vehicle that has turned since the slope of
+    the line was measured, so that the accelerometer bias b counts in full; infinite for sensors without errors.
+    """
+    imu, q = calibration.imu, calibration.dvl.velocity_walk_density
+    tilting, turned = (calibration.gravity_m_s2 * imu.gyro_noise_density) ** 2 / 20.0, imu.accel_bias_sigma**2 / 4.0
+    more = max(q**2 - imu.accel_noise_density**2, 0.0) / 3.0
+    root = turned + math.sqrt(turned**2 + 4.0 * tilting * more)
+    return 2.0 * more / root if root > 0.0 else math.inf
 
 
 class Stretch(NamedTuple):
@@ -89,12 +106,20 @@ def continued(
 
 
 def bridge(
-    rows: Rows, sensors: Sensors, start_ns: int, end_ns: int, is_closed: bool, bias: Floats, earth: Floats = ZERO
+    rows: Rows,
+    sensors: Sensors,
+    start_ns: int,
+    end_ns: int,
+    is_closed: bool,
+    bias: Floats,
+    earth: Floats = ZERO,
+    asked_ns: int | None = None,
 ) -> PreintegratedMotion:
     """Motion over a gap from an epoch to the next one (closed), or to an instant before it (open).
 
     Used are rows known at the end, of a closed gap until an inertial row covers it. Removed are the gyro bias (body
-    axes) and the Earth's rotation (frame i), rad/s.
+    axes) and the Earth's rotation (frame i), rad/s. ``asked_ns``: end of the whole of which this is the first part,
+    which decides whether it is a walk.
     """
     rows = rows if is_closed else rows.known(end_ns)
     dvl_ns, T = rows.dvl_ns, (end_ns - start_ns) * 1e-9
@@ -119,6 +144,8 @@ def bridge(
             return motion
         doppler_psd = np.tensordot(squares_s2 / T, rows.cov[k : k + 2], 1)
         return _walk(rows, sensors, start_ns, end_ns, bias, earth, doppler_psd)
+    if ((asked_ns or end_ns) - start_ns) * 1e-9 > sensors.longest_open_s:
+        return _walk(rows, sensors, start_ns, end_ns, bias, earth)
     samples = np.arange(np.searchsorted(dvl_ns, max(start_ns - WINDOW_NS, rows.imu_ns[0])), k + 1)
     t = (dvl_ns[samples] - start_ns) * 1e-9
     if len(t) >= FEWEST and -t[0] >= SHORTEST_S:

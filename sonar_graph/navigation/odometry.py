@@ -186,7 +186,7 @@ class Odometry:
         before_ns = self.epochs(dvl_ns[0] - 1, min(end_ns, known_ns))
         if len(before_ns) and before_ns[-1] < start_ns < end_ns and self.is_gap(int(before_ns[-1]), end_ns):
             lost_ns = int(before_ns[-1])
-            return remaining_motion(*(self._since(lost_ns, t, known_ns, *noise) for t in (start_ns, end_ns)))
+            return remaining_motion(*(self._since(lost_ns, t, known_ns, *noise, end_ns) for t in (start_ns, end_ns)))
         return self._since(start_ns, end_ns, known_ns, *noise)
 
     def motions(self, start_ns: Ints, end_ns: Ints, known_ns: Ints, bias: Floats) -> Motions:
@@ -216,7 +216,9 @@ class Odometry:
         imu_ns, dvl_ns = self._imu.stamps_ns, self._dvl.stamps_ns
         return Rows(imu_ns, rate, force, dvl_ns, velocity, cov, known_ns, self._hold_past, self._turns)
 
-    def _since(self, start_ns: int, end_ns: int, known_ns: int, bias: Floats, earth: Floats) -> PreintegratedMotion:
+    def _since(
+        self, start_ns: int, end_ns: int, known_ns: int, bias: Floats, earth: Floats, asked_ns: int | None = None
+    ) -> PreintegratedMotion:
         """Motion from an instant: final to the newest epoch, provisional from there on.
 
         Over gaps between epochs it goes by bridges; between gaps it is one sum of steps.
@@ -241,7 +243,8 @@ class Odometry:
         is_lost = len(epochs_ns) > 0 and self.is_gap(newest_ns, end_ns)
         _, motion = self._followed(before, stretch, rows, newest_ns if is_lost else end_ns, bias, earth)
         if is_lost:
-            return _joined(motion, bridge(rows, sensors, newest_ns, end_ns, False, bias, _in_frame(motion, earth)))
+            earth = _in_frame(motion, earth)
+            return _joined(motion, bridge(rows, sensors, newest_ns, end_ns, False, bias, earth, asked_ns))
         return motion or motion_over(rows, sensors, start_ns, start_ns, bias, earth)
 
     def _followed(

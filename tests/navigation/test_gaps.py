@@ -11,6 +11,7 @@ from sonar_graph.errors import MeasurementError
 from sonar_graph.estimator import load_estimator
 from sonar_graph.measurements import Dvl, Imu, Measurements
 from sonar_graph.navigation import Odometry
+from sonar_graph.navigation.dvl_gaps import longest_open_s
 from sonar_graph.navigation.imu_gaps import Turns, closed_variance, error_in_hole, hole_ns, open_variance
 from sonar_graph.navigation.joint_preintegration import JointPreintegrator
 from sonar_graph.testing import check_consistent
@@ -68,6 +69,22 @@ def test_too_few_samples_for_a_line_leave_a_walk():
     assert found.i_T_j.equals(walked.i_T_j, 0.0)
     assert np.array_equal(found.covariance, walked.covariance)
     assert not motion(imu, dvl, known, ways.LOST_S, ways.OPEN_S).i_T_j.equals(walked.i_T_j, 0.1)
+
+
+def test_a_gap_that_stays_open_is_a_walk_once_accelerometers_are_less_sure_than_that():
+    """Both variances of the limit's equation are equal there; the end of the gap brings the accelerometers back."""
+    cheap = ImuCalibration(gyro_noise_density=3e-3, accel_noise_density=1e-2, accel_bias_sigma=0.05)
+    known = Calibration(imu=cheap, dvl=DVL)
+    T, g, q = longest_open_s(known), known.gravity_m_s2, DVL.velocity_walk_density
+    assert 1e-4 * T**3 / 3 + (g * 3e-3) ** 2 * T**5 / 20 + 0.05**2 * T**4 / 4 == pytest.approx(q**2 * T**3 / 3)
+    assert 2.0 < T < Vehicle.FOUND_S - Vehicle.LOST_S - 1.0
+    (imu_rows, dvl_rows), lost_s = Vehicle().rows(), Vehicle.LOST_S
+    for until_s, is_walk in ((lost_s + T - 0.1, False), (lost_s + T + 0.1, True), (Vehicle.FOUND_S, False)):
+        found, walked = (motion(rows, dvl_rows, known, lost_s, until_s) for rows in (imu_rows, ways.blinded(imu_rows)))
+        assert found.i_T_j.equals(walked.i_T_j, 0.0) == is_walk
+        assert np.array_equal(found.covariance, walked.covariance) == is_walk
+    exact = ImuCalibration(gyro_noise_density=0.0, accel_noise_density=0.0, accel_bias_sigma=0.0)
+    assert longest_open_s(Calibration(imu=exact)) == np.inf
 
 
 @pytest.mark.parametrize("until_s", [16.0, 15.9, 14.0])
