@@ -160,8 +160,10 @@ def compare_log(
     settings: list[str] | None,
 ) -> Comparison:
     """Read a log, recognise landmarks if it needs that, and compare estimators; mistakes are reported first."""
+    from sonar_graph.diagnosis import wrong_units
     from sonar_graph.evaluation import check_request
     from sonar_graph.evaluation import compare as compare_runs
+    from sonar_graph.logs.adapters import LogConfig
     from sonar_graph.recognition import no_images, with_detections
 
     overrides = estimator_settings(settings, names)
@@ -171,6 +173,9 @@ def compare_log(
     with progress_bars() as progress:
         sequence = reading.read(log, progress=partial(progress, f"reading {log.name}"))
     check_rate(rate_hz, sequence)
+    if units := wrong_units(sequence, reading.config or LogConfig()):
+        said = "; ".join(f"{one.quantity}: {one.advice}" for one in units)
+        sequence = replace(sequence, notes={**sequence.notes, "log.units": said})
     found = None
     if sequence.detections is None or recognition.is_given:
         found = recognise_log(log, sequence, reading, recognition.recogniser(sequence.calibration))

@@ -2,8 +2,8 @@
 
 # fmt: off
 from sonar_graph.diagnosis.findings import Finding
-from sonar_graph.diagnosis.sensor_check import check_sensors
+from sonar_graph.diagnosis.sensor_check import check_sensors, wrong_units
 
 __all__ = [
-    "Finding", "check_sensors",
+    "Finding", "check_sensors", "wrong_units",
 ]

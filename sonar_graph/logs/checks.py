@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sonar_graph.calibration import HOLE_INTERVALS, ROWS_BEFORE, SHORTEST_HOLE_S, UNTYPICAL_S, Calibration, Mounting
 from sonar_graph.devices import UNMEASURED_M_S
 from sonar_graph.logs.adapters import Z_DOWN_TYPES, Adapter
-from sonar_graph.measurements import Dvl, Floats, Imu, Ints
+from sonar_graph.measurements import Depth, Dvl, Floats, Imu, Ints
 
 MOST_NAMED = 3
 """Gaps or stretches of one kind that are named one by one; of more, the longest."""
@@ -20,12 +20,19 @@ LEAST_PART_UPWARDS = 0.7
 """Part of the typical specific force that must point up in the body."""
 MOST_OFF_GRAVITY = 0.2
 """Relative difference between specific force and gravity above which units are in doubt."""
-SPIKE_RAD_S = 1.0
+SPIKES = {
+    "angular rate": (1.0, "rad/s", "heading is wrong from there on"),
+    "specific force": (30.0, "m/s2", "gravity and gaps of the Doppler log are wrong there"),
+}
+"""Least spike of a quantity, its unit, and what it does; 3 g of a single sample, without a trace in the next, is no
+blow."""
 SPIKE_RATIO = 20.0
 """A spike exceeds the 99 % quantile of all differences by this factor."""
 LARGEST_LAG_S = 1.0
 """Median time between stamp and recording that is still usual."""
 LARGEST_LAG_CHANGE_S = 0.5
+FARTHEST_FROM_START_M = 2.0
+"""Height that a vehicle gains about the start, with its depth sensor's error."""
 STUCK_S = 1.0
 STUCK_ROWS = 5
 """Equal rows are named when they last longer than `STUCK_S` and are at least this many."""
@@ -196,38 +203,58 @@ def axes_warning(adapter: Adapter) -> str | None:
     )
 
 
-def spike_warning(imu: Imu) -> str | None:
-    """Warning about angular rates of single samples that differ from both neighbours, which agree; None: there is none.
-
-    ``e_k = |w_k - (w_k-1 + w_k+1) / 2|`` is a spike above `SPIKE_RAD_S` and `SPIKE_RATIO` times its 99 % quantile,
-    where ``|w_k+1 - w_k-1| < e_k / 2``.
-    """
-    rate = imu.angular_velocity
-    if len(rate) < 3:
+def start_depth_warning(depth: Depth, start_ns: int, calibration: Calibration) -> str | None:
+    """Warning where the heights about the start, whose instant is given, are not that of the start's pose."""
+    start, port_m = calibration.start, np.array(calibration.depth.port_m)
+    if "position_m" not in start.model_fields_set:
         return None
-    off = np.linalg.norm(rate[1:-1] - (rate[:-2] + rate[2:]) / 2, axis=1)
-    agree = np.linalg.norm(rate[2:] - rate[:-2], axis=1) < off / 2
-    spikes = np.flatnonzero(agree & (off > max(SPIKE_RAD_S, SPIKE_RATIO * float(np.quantile(off, 0.99))))) + 1
-    if not spikes.size:
+    first = max(int(np.searchsorted(depth.stamps_ns, start_ns)) - 1, 0)
+    height_m = float(np.median(depth.z_m[first : first + 5]))
+    stated_m = float(start.pose().transformFrom(port_m)[2])
+    if abs(height_m - stated_m) <= FARTHEST_FROM_START_M + 3.0 * start.position_sigma_m[2]:
         return None
-    largest = int(spikes[np.argmax(off[spikes - 1])])
-    at_s = (imu.stamps_ns[largest] - imu.stamps_ns[0]) * 1e-9
     return (
-        f"{_count(len(spikes), 'angular rate')} {'stands' if len(spikes) == 1 else 'stand'} out from both neighbours, "
-        f"by {off[largest - 1]:.3g} rad/s at most, {at_s:.3f} s after the first: heading is wrong from there on, leave "
-        f"such messages out"
+        f"the height begins at {height_m:.2f} m, the start of the calibration is at {stated_m:.2f} m: another sign, "
+        "unit or origin? Depths far from the start are not used; give scale (-1 for depths downwards), or the start"
     )
 
 
-def stuck_warning(stamps_ns: Ints, values: Floats, quantity: str) -> str | None:
-    """Warning about stretches of rows, shape (n, 3), that are equal to the bit, zeros or not; None: there are none.
+def spike_warning(stamps_ns: Ints, values: Floats, quantity: str) -> str | None:
+    """Warning about single samples, shape (n, 3), that differ from both neighbours, which agree; None: there is none.
 
-    Such rows are used as they are. A vehicle at rest in a simulator or a coarse sensor may look the same.
+    ``e_k = |w_k - (w_k-1 + w_k+1) / 2|`` is a spike above the least of `SPIKES` and `SPIKE_RATIO` times its 99 %
+    quantile, where ``|w_k+1 - w_k-1| < e_k / 2``.
+    """
+    if len(values) < 3:
+        return None
+    least, unit, effect = SPIKES[quantity]
+    off = np.linalg.norm(values[1:-1] - (values[:-2] + values[2:]) / 2, axis=1)
+    off[np.isnan(off)] = 0.0
+    agree = np.linalg.norm(values[2:] - values[:-2], axis=1) < off / 2
+    spikes = np.flatnonzero(agree & (off > max(least, SPIKE_RATIO * float(np.quantile(off, 0.99))))) + 1
+    if not spikes.size:
+        return None
+    largest = int(spikes[np.argmax(off[spikes - 1])])
+    at_s = (stamps_ns[largest] - stamps_ns[0]) * 1e-9
+    return (
+        f"{_count(len(spikes), quantity)} {'stands' if len(spikes) == 1 else 'stand'} out from both neighbours, "
+        f"by {off[largest - 1]:.3g} {unit} at most, {at_s:.3f} s after the first: {effect}, leave such messages out"
+    )
+
+
+def stuck_warning(stamps_ns: Ints, values: Floats, quantity: str, *, is_coarse: bool = False) -> str | None:
+    """Warning about stretches of rows, shape (n, k), that are equal to the bit, zeros or not; None: there are none.
+
+    Such rows are used as they are. A vehicle at rest in a simulator or a coarse sensor may look the same: of a sensor
+    that ``is_coarse``, n rows of which a share p repeats the row before, a stretch of m counts that comes by chance
+    less than once in a thousand such logs, ``n p^(m - 1) < 0.001``.
     """
     differs = np.any(values[1:] != values[:-1], axis=1)
     first = np.concatenate([[0], np.flatnonzero(differs) + 1])
     last = np.concatenate([first[1:] - 1, [len(values) - 1]])
     is_long = (stamps_ns[last] - stamps_ns[first] > STUCK_S * 1e9) & (last - first + 1 >= STUCK_ROWS)
+    if is_coarse and differs.any():
+        is_long &= len(values) * (1.0 - differs.mean()) ** (last - first) < 1e-3
     is_zero = ~np.any(values[first], axis=1)
     texts = []
     for chosen, what in ((is_long & is_zero, "exactly zero"), (is_long & ~is_zero, "the same to the last bit")):

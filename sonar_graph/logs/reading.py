@@ -37,6 +37,7 @@ from sonar_graph.logs.checks import (
     is_partial,
     spike_warning,
     stamp_faults,
+    start_depth_warning,
     stuck_warning,
 )
 from sonar_graph.logs.geodesy import Origin
@@ -55,7 +56,7 @@ from sonar_graph.logs.vehicle_setup import (
 from sonar_graph.measurements import Block, Dvl, Imu
 from sonar_graph.sequence import Sequence
 
-FOUND_ANEW = frozenset({"log.warnings", "log.gaps", "log.noise"})
+FOUND_ANEW = frozenset({"log.warnings", "log.gaps", "log.noise", "log.units"})
 """Notes about the rows of a log; those of an earlier reading may no longer hold."""
 
 NOISE_FIELDS = {
@@ -330,20 +331,27 @@ class Assembly:
         """Sentences about messages that can be read but look wrong, each after its role."""
         for role, table in self._tables.items():
             yield from (f"{role}: {text}" for text in self._adapters[role].warnings(table))
-        imu, dvl, detections = self.block("imu"), self.block("dvl"), self.block("detections")
+        imu, dvl, depth, detections = (self.block(role) for role in ("imu", "dvl", "depth", "detections"))
         mounting, gravity_m_s2 = self.calibration.imu.mounting, self.calibration.gravity_m_s2
         is_linear = self.calibration.odometry_interpolation == "linear"  # otherwise rates jump, and wheels turn evenly
         found: list[tuple[str, str | None]] = []
         if imu is not None:
             found.append(("imu", gravity_warning(imu.specific_force, mounting, gravity_m_s2)))
         if imu is not None and is_linear:
-            found.append(("imu", spike_warning(imu)))
-            found.append(("imu", stuck_warning(imu.stamps_ns, imu.angular_velocity, "angular rate")))
+            columns = (("angular rate", imu.angular_velocity), ("specific force", imu.specific_force))
+            found += [("imu", spike_warning(imu.stamps_ns, values, quantity)) for quantity, values in columns]
+            found += [("imu", stuck_warning(imu.stamps_ns, values, quantity)) for quantity, values in columns]
         if dvl is not None and is_linear:
             found.append(("dvl", stuck_warning(dvl.stamps_ns, dvl.velocity, "velocity")))
+        if depth is not None:
+            found.append(("depth", stuck_warning(depth.stamps_ns, depth.z_m[:, None], "height", is_coarse=True)))
+        if imu is not None and dvl is not None and depth is not None:
+            start_ns = max(imu.stamps_ns[0], dvl.stamps_ns[0])
+            found.append(("depth", start_depth_warning(depth, int(start_ns), self.calibration)))
         if "dvl" in self._tables and not self._is_mounting_known:
             found.append(("dvl", axes_warning(self._adapters["dvl"])))
         yield from (f"{role}: {text}" for role, text in found if text)
+        yield from unsaid_noise({role: self.block(role) for role in NOISE_FIELDS}, only_partly=True)
         stamps = [self._tables[role].stamps_ns for role in ("imu", "dvl") if role in self._tables]
         if detections is not None and len(stamps) == 2:
             first_ns, last_ns = max(ns.min() for ns in stamps), min(ns.max() for ns in stamps)
@@ -373,13 +381,16 @@ def _span(rows: Block) -> str:
     return f"from {rows.stamps_ns[0] * 1e-9:.3f} to {rows.stamps_ns[-1] * 1e-9:.3f} s"
 
 
-def unsaid_noise(blocks: Mapping[str, Any]) -> Iterator[str]:
-    """Sensors with rows of unknown covariance, for which the noise of the calibration counts; blocks by role."""
+def unsaid_noise(blocks: Mapping[str, Any], *, only_partly: bool = False) -> Iterator[str]:
+    """Sensors with rows of unknown covariance, for which the noise of the calibration counts; blocks by role.
+
+    With ``only_partly`` those of which other rows say one: a sensor that mostly knows its noise and here does not.
+    """
     for role, (column, fields) in NOISE_FIELDS.items():
         if (block := blocks.get(role)) is not None:
             covariances = getattr(block, column)
             count = np.count_nonzero(np.isnan(covariances.reshape(len(covariances), -1)).any(axis=1))
-            if count:
+            if count and not (only_partly and count == len(covariances)):
                 yield f"{role}: {count} of {len(covariances)} rows say no covariance, {fields} of the calibration count"
 
 

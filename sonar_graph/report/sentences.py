@@ -55,6 +55,7 @@ SAID_NOTES = {
     "log.dropped": "Log, left out",
     "log.warnings": WARNING,
     "log.gaps": WARNING,
+    "log.units": WARNING,
 }
 """Notes that the terminal shows, and the word before each; the report has all notes."""
 

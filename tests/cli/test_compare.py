@@ -14,6 +14,7 @@ from sonar_graph.errors import EvaluationError
 from sonar_graph.estimator import load_estimator
 from sonar_graph.evaluation.storage import read_comparison
 from sonar_graph.logs.reading import read_log
+from sonar_graph.logs.writing import write_log
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.basin import FASTEST_M_S, PAPER_LAPS, BasinOptions, cruise_speed
@@ -82,6 +83,17 @@ def test_run_writes_one_estimator_with_the_calibration_given_before_that_of_the_
     assert changed["start"].pop("position_m") != of_log["start"].pop("position_m")
     assert changed == of_log
     assert said["notes"]["log.calibration"] == f"from {moved}: start.position_m; else from the log"
+
+
+def test_compare_names_a_wrong_unit_that_inspect_names_and_none_of_a_sound_log(run, basin, tmp_path, capsys):
+    sequence, log = read_log(basin), tmp_path / "degrees.mcap"
+    rate = np.degrees(sequence.imu.angular_velocity)
+    write_log(log, replace(sequence, imu=replace(sequence.imu, angular_velocity=rate)))
+    named = []
+    for which in (log, basin):
+        assert run("run", which, "--estimator", "dead-reckoning", "-o", tmp_path / "out") == 0
+        named.append("Warning: gyro: unit: rates look 57 times too large" in capsys.readouterr().out)
+    assert named == [True, False]
 
 
 def test_estimators_lists_every_setting(run, capsys):

@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration
+from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Start
 from sonar_graph.devices.dvl_beams import UNMEASURED_M_S
 from sonar_graph.errors import LogError
-from sonar_graph.logs.checks import gap_warnings, spike_warning, stamp_faults, stuck_warning
+from sonar_graph.logs.checks import gap_warnings, spike_warning, stamp_faults, start_depth_warning, stuck_warning
 from sonar_graph.logs.reading import require_use, unsaid_noise
 from sonar_graph.measurements import Depth, Dvl, Floats, Imu, LandmarkDetections
 from sonar_graph.navigation.imu_gaps import hole_ns
@@ -172,9 +172,45 @@ SHAKING = 2.0 * np.random.default_rng(3).standard_normal((3000, 3))
     ],
 )  # fmt: skip
 def test_only_single_wild_rates_are_spikes(rate: Floats, expected: str | None) -> None:
-    found = spike_warning(Imu(EVEN[0] + np.arange(len(rate)) * SECOND // 100, rate, np.full(rate.shape, np.nan)))
+    found = spike_warning(EVEN[0] + np.arange(len(rate)) * SECOND // 100, rate, "angular rate")
     assert (found or "").startswith(expected or "")
     assert (found is None) == (expected is None)
+
+
+def test_a_single_wild_force_is_a_spike_and_unmeasured_ones_are_none() -> None:
+    stamps_ns, force = EVEN[0] + np.arange(3000) * SECOND // 100, turning(((2000, 1), -500.0)) + np.array([0, 0, 9.81])
+    expected = "1 specific force stands out from both neighbours, by 500 m/s2 at most, 20.000 s"
+    assert (spike_warning(stamps_ns, force, "specific force") or "").startswith(expected)
+    assert spike_warning(stamps_ns, turning(((2000, 1), -20.0)), "specific force") is None
+    force[100:200] = np.nan
+    assert (spike_warning(stamps_ns, force, "specific force") or "").startswith(expected)
+    assert spike_warning(stamps_ns, np.full_like(force, np.nan), "specific force") is None
+
+
+def test_a_coarse_height_repeats_itself_and_one_that_hangs_is_stuck() -> None:
+    rng, stamps_ns = np.random.default_rng(4), EVEN[0] + np.arange(1500) * SECOND // 5
+    fine = 3.0 + np.cumsum(0.003 * rng.standard_normal(1500))[:, None]
+    for step_m, hangs_s in ((1e-4, 5.0), (0.01, 60.0)):
+        height = np.round(fine / step_m) * step_m
+        assert stuck_warning(stamps_ns, height, "height", is_coarse=True) is None
+        height[500 : 500 + round(5 * hangs_s)] = height[500]
+        assert "height the same to the last bit" in (stuck_warning(stamps_ns, height, "height", is_coarse=True) or "")
+    assert "in 1500 rows" in (stuck_warning(stamps_ns, 0 * fine + 3.0, "height", is_coarse=True) or "")
+
+
+@pytest.mark.parametrize(
+    ("z_m", "stated", "is_told"),
+    [(-3.0, -3.0, False), (-4.5, -3.0, False), (3.0, -3.0, True), (-3000.0, -3.0, True), (-50.0, None, False)],
+)
+def test_heights_that_do_not_begin_at_the_stated_start_are_told(
+    z_m: float, stated: float | None, is_told: bool
+) -> None:
+    start = Start() if stated is None else Start(position_m=(5.0, 5.0, stated))
+    rows = Depth(stamps(PINGS), np.full(len(PINGS), -90.0), np.full(len(PINGS), np.nan))
+    rows.z_m[98:104] = z_m
+    found = start_depth_warning(rows, int(rows.stamps_ns[100]), Calibration(start=start))
+    assert (found or "").startswith(f"the height begins at {z_m:.2f} m" if is_told else "")
+    assert (found is not None) == is_told
 
 
 def moving(*stretches: tuple[slice, Any], rows: int = 300) -> Floats:
