@@ -1,13 +1,16 @@
-"""Dead reckoning: gyros and Doppler log from a given start; docs/theory/dead_reckoning.md."""
+"""Dead reckoning: gyros and Doppler log from a given start, level by gravity; docs/theory/dead_reckoning.md."""
 
+import math
 from typing import ClassVar
 
 import gtsam
 import numpy as np
+from pydantic import Field
 
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.measurements import Floats, Measurements
 from sonar_graph.motion import MotionSource, PreintegratedMotion, require_source
+from sonar_graph.navigation.alignment import gravity_direction
 from sonar_graph.states import (
     CausalEstimates,
     DetectionJournal,
@@ -21,7 +24,10 @@ from sonar_graph.states import (
 
 
 class DeadReckoningParams(Section):
-    """Settings of dead reckoning: none."""
+    """Settings of dead reckoning."""
+
+    gravity_interval_s: float = Field(1.0, gt=0)
+    """Least time between updates of roll and pitch by gravity, where the calibration uses it."""
 
 
 class DeadReckoning:
@@ -35,7 +41,13 @@ class DeadReckoning:
                                  [ 0          I ]
 
     for the perturbation [theta, rho, bias]. The bias is *considered*: its mean stays zero, and its uncertainty widens
-    the covariance and correlates successive errors. Depth, gravity and detections are not used.
+    the covariance and correlates successive errors. Roll and pitch are kept by the direction of gravity, with
+    ``up = world_R_body^T e_z`` (`sonar_graph.navigation.alignment.gravity_direction`)::
+
+        e = measured up - up,    H = [ [up]x  0  0 ],    K = P H^T (H P H^T + sigma^2 I)^-1, zero for the bias
+        P <- (I - K H) P (I - K H)^T + sigma^2 K K^T
+
+    Depth and detections are not used.
 
     Parameters
     ----------
@@ -54,7 +66,7 @@ class DeadReckoning:
     ) -> None:
         require_source(odometry, calibration, "DeadReckoning(calibration, odometry, params)")
         self._params = params or DeadReckoningParams()
-        self._odometry = odometry
+        self._odometry, self._calibration = odometry, calibration
         has_bias = calibration.imu.gyro_bias_sigma > 0
         self._walk_density = calibration.imu.gyro_bias_walk_density if has_bias else 0.0
         self._pose = calibration.start.pose()
@@ -64,6 +76,9 @@ class DeadReckoning:
         self._P[3:6, 3:6] = R.T @ np.diag(np.square(start.position_sigma_m)) @ R
         self._P[6:, 6:] = np.eye(3) * calibration.imu.gyro_bias_sigma**2
         self._epoch_ns: int | None = None
+        self._felt: PreintegratedMotion | None = None
+        """Motion since gravity was used, from the epoch with this velocity of the IMU and its variance."""
+        self._felt_from: tuple[Floats, float] | None = None
         self._estimates = CausalEstimates()
         self._journal = DetectionJournal()
 
@@ -87,8 +102,13 @@ class DeadReckoning:
             return None
         for reached_ns in self._odometry.epochs(epoch_ns, end_ns).tolist():
             motion = self._odometry.motion(epoch_ns, reached_ns, ZERO_BIAS, self._attitude(), known_ns=end_ns)
+            self._felt_from = self._felt_from or self._odometry.velocity_at_imu(epoch_ns)
             self._pose, self._P = self._after(motion)
+            self._felt = motion if self._felt is None else self._felt.then(motion)
             epoch_ns = reached_ns
+            if self._felt.duration_s >= self._params.gravity_interval_s and self._calibration.use_gravity:
+                self._level(self._felt, self._felt_from, self._odometry.velocity_at_imu(epoch_ns))
+                self._felt = self._felt_from = None
         self._odometry.forget_before(epoch_ns)
         self._epoch_ns = epoch_ns
         pose, P = self._after(self._odometry.motion(epoch_ns, end_ns, ZERO_BIAS, self._attitude()))
@@ -116,6 +136,22 @@ class DeadReckoning:
     def _attitude(self) -> Floats:
         """world_R_body at the newest epoch."""
         return self._pose.rotation().matrix()
+
+    def _level(self, felt: PreintegratedMotion, begin: tuple[Floats, float], end: tuple[Floats, float]) -> None:
+        """Correct by gravity's direction over an interval, with the IMU's velocities and variances at its ends."""
+        sigma_m_s = math.sqrt(0.5 * (begin[1] + end[1]))
+        found = gravity_direction(felt, begin[0], end[0], sigma_m_s, self._calibration)
+        if found is None:
+            return
+        (measured, sigma), up = found, self._attitude()[2]
+        H = np.zeros((3, 9))
+        H[:, :3] = np.cross(np.eye(3), up)  # [up]x
+        K = np.linalg.solve(H @ self._P @ H.T + sigma**2 * np.eye(3), H @ self._P).T
+        K[6:] = 0.0
+        A = np.eye(9) - K @ H
+        self._pose = self._pose.compose(gtsam.Pose3.Expmap((K @ (measured - up))[:6]))
+        P = A @ self._P @ A.T + sigma**2 * K @ K.T
+        self._P = 0.5 * (P + P.T)
 
     def _after(self, motion: PreintegratedMotion) -> tuple[gtsam.Pose3, Floats]:
         """Pose, and covariance of [theta, rho, bias], shape (9, 9), after a motion."""

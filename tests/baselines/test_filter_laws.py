@@ -35,6 +35,7 @@ from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 from sonar_graph.slam.landmarks import ACCEPTED
 from sonar_graph.states import CausalEstimates, Estimate, Outcome, Refusal
+from sonar_graph.testing import check_consistent
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks" / "performance"
 T0_NS = 1_700_000_000 * NS_PER_S
@@ -208,6 +209,28 @@ def test_dead_reckoning_s_covariance_is_that_of_many_runs_with_a_constant_bias()
     sigma = np.sqrt(np.diag(mean.covariance))
     scale = np.outer(sigma, sigma)
     assert_allclose(np.cov(np.array(errors).T) / scale, mean.covariance / scale, atol=0.2)
+
+
+def test_dead_reckoning_is_level_by_gravity_and_as_sure_of_its_tilt_as_it_is_right():
+    """Gyro bias and noise tilt it by 20 mrad without accelerometers."""
+    bias_sigma, rng, squares, tilts = 1e-3, np.random.default_rng(5), [], []
+    known = circle_calibration(gyro_bias_sigma=bias_sigma, gyro_bias_walk_density=0.0, accel_bias_sigma=1e-4)
+    start = CIRCLE_START.model_copy(update={"rpy_sigma_rad": (1e-6,) * 3})
+    known, end = known.model_copy(update={"start": start}), Rotation.from_euler("z", 0.5 + YAW_RATE * CIRCLE_S)
+    force = np.array([0.0, SPEED * YAW_RATE, known.gravity_m_s2])
+    for _ in range(20):
+        rate, felt = np.sqrt(50) * rng.normal(size=(2, 50 * CIRCLE_S + 1, 3))
+        gyro, doppler = circle(bias_sigma * rng.normal(size=3) + 1e-3 * rate, 0.02 * rng.normal(size=(101, 3)))
+        level = replace(gyro, specific_force=force + known.imu.accel_noise_density * felt)
+        found, blind = (estimate_after(DeadReckoning, known, CIRCLE_S, rows, doppler) for rows in (level, gyro))
+        off = [
+            (end.inv() * Rotation.from_matrix(one.world_T_body.rotation().matrix())).as_rotvec()
+            for one in (found, blind)
+        ]
+        squares.append(off[0][:2] @ np.linalg.solve(found.covariance[:2, :2], off[0][:2]))
+        tilts.append([np.hypot(*turn[:2]) for turn in off])
+    assert np.mean(tilts, axis=0)[0] < 0.3 * np.mean(tilts, axis=0)[1]
+    check_consistent(np.array(squares), 2, confidence=0.999)
 
 
 def test_dead_reckoning_ignores_detections_and_says_so():
@@ -691,3 +714,11 @@ def test_a_logged_depth_variance_goes_before_the_calibration_s_and_a_negative_on
         [],
         [Refusal.UNSOUND],
     ]
+
+
+@slam_filters
+def test_an_innovation_that_a_source_of_motion_lets_be_impossible_is_an_error_with_its_time(kind, monkeypatch):
+    """Ours refuses such rows; that of somebody else may not."""
+    monkeypatch.setattr(Odometry, "used_depths", lambda _, depth: depth)
+    with pytest.raises(EstimatorError, match=rf"{kind.name}: between \d+ and \d+ ns .* variances above zero"):
+        run(kind, in_a_gap(depths(np.array([later(1.0)]), 1.0, -1e6)))
