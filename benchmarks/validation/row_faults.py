@@ -293,7 +293,7 @@ def imu_first_second_in_1970(rows: SimpleNamespace, _: Generator) -> Effect:
 def imu_clock_jumps_an_hour(rows: SimpleNamespace, _: Generator) -> Effect:
     half = np.arange(len(rows.stamps_ns)) > len(rows.stamps_ns) // 2
     rows.stamps_ns[half] += 3600 * NS
-    return Effect(half)
+    return Effect(turn_rad=float(np.linalg.norm(rows.angular_velocity[half], axis=1).sum()) * interval_s(rows))
 
 
 @fault("imu", "imu.*(backwards|drift apart|clock)")

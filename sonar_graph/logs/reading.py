@@ -34,6 +34,7 @@ from sonar_graph.logs.checks import (
     axes_warning,
     gap_warnings,
     gravity_warning,
+    gyro_warning,
     is_partial,
     spike_warning,
     stamp_faults,
@@ -341,6 +342,8 @@ class Assembly:
             columns = (("angular rate", imu.angular_velocity), ("specific force", imu.specific_force))
             found += [("imu", spike_warning(imu.stamps_ns, values, quantity)) for quantity, values in columns]
             found += [("imu", stuck_warning(imu.stamps_ns, values, quantity)) for quantity, values in columns]
+        if imu is not None and dvl is not None and is_linear and not found[0][1]:  # gravity is upwards
+            found.append(("imu", gyro_warning(imu, dvl, self.calibration)))
         if dvl is not None and is_linear:
             found.append(("dvl", stuck_warning(dvl.stamps_ns, dvl.velocity, "velocity")))
         if depth is not None:

@@ -147,7 +147,7 @@ def gathered(
     Mountings of ``/tf_static`` are by sensor; of ``depth`` and ``positions`` only the translation counts.
     Fields that together are no calibration are a CalibrationError, which names the user's source.
     """
-    values = Calibration().model_dump()
+    values = Calibration().model_dump(exclude={"start"})  # a start that nobody states is not set
     for sensor, mounting in mountings.items():
         is_place = MOUNTING_FIELDS[sensor] != "mounting"
         values[sensor][MOUNTING_FIELDS[sensor]] = mounting.translation_m if is_place else mounting.model_dump()
@@ -156,6 +156,11 @@ def gathered(
     if given is None:
         return Calibration.model_validate(values)
     return parse(Calibration, _over(values, given.values), given.source)
+
+
+def recorded_calibration(calibration: Calibration) -> str:
+    """JSON of a calibration for a log's record, without a start that nobody stated."""
+    return calibration.model_dump_json(exclude=None if "start" in calibration.model_fields_set else {"start"})
 
 
 def mounted_by(values: Values) -> set[str]:

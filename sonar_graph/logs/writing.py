@@ -30,7 +30,7 @@ from sonar_graph.logs.roles import (
     SONAR_IMAGE,
     TF,
 )
-from sonar_graph.logs.vehicle_setup import BODY_FRAME, METADATA, encode_mountings
+from sonar_graph.logs.vehicle_setup import BODY_FRAME, METADATA, encode_mountings, recorded_calibration
 from sonar_graph.measurements import (
     NO_TRACK,
     NS_PER_S,
@@ -109,7 +109,7 @@ def write_log(path: str | Path, sequence: Sequence, more: Iterable[Outgoing] = (
         messages.append(of_truth[1](f"/ground_truth/{of_truth[0]}", sequence.truth))
     record = {
         "name": sequence.name,
-        "calibration": sequence.calibration.model_dump_json(),
+        "calibration": recorded_calibration(sequence.calibration),
         "notes": json.dumps(sequence.notes),
     }
     with recording(path, {METADATA: record}) as out:

@@ -5,13 +5,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Start
+from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting, Start
 from sonar_graph.devices.dvl_beams import UNMEASURED_M_S
 from sonar_graph.errors import LogError
-from sonar_graph.logs.checks import gap_warnings, spike_warning, stamp_faults, start_depth_warning, stuck_warning
+from sonar_graph.logs.checks import (
+    gap_warnings,
+    gyro_warning,
+    spike_warning,
+    stamp_faults,
+    start_depth_warning,
+    stuck_warning,
+)
 from sonar_graph.logs.reading import require_use, unsaid_noise
 from sonar_graph.measurements import Depth, Dvl, Floats, Imu, LandmarkDetections
 from sonar_graph.navigation.imu_gaps import hole_ns
+from sonar_graph.simulation import MissionOptions, simulate_mission
 
 PINGS, SAMPLES = np.arange(1500) * 0.2, np.arange(30000) * 0.01
 NAN = (np.nan,) * 3
@@ -211,6 +219,28 @@ def test_heights_that_do_not_begin_at_the_stated_start_are_told(
     found = start_depth_warning(rows, int(rows.stamps_ns[100]), Calibration(start=start))
     assert (found or "").startswith(f"the height begins at {z_m:.2f} m" if is_told else "")
     assert (found is not None) == is_told
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (np.eye(3), None),
+        (-np.eye(3), "(-x, -y, -z)"),
+        (np.diag([1.0, 1.0, -1.0]), "(x, y, -z)"),
+        (np.eye(3)[[1, 0, 2]], "(y, x, z)"),
+        (np.eye(3)[[1, 2, 0]], "(z, x, y)"),
+        (0.9 * np.eye(3), None),
+    ],
+)
+def test_rates_about_other_axes_are_told_by_how_gravity_turns(change: Floats, told: str | None) -> None:
+    world = simulate_mission(MissionOptions(duration_s=90.0))
+    mounted = world.calibration.imu.model_copy(update={"mounting": Mounting(rpy_rad=(0.3, -0.2, 1.0))})
+    sensor_R_body = mounted.mounting.pose().rotation().matrix().T
+    rate, force = world.imu.angular_velocity @ change.T @ sensor_R_body.T, world.imu.specific_force @ sensor_R_body.T
+    known = world.calibration.model_copy(update={"imu": mounted})
+    found = gyro_warning(Imu(world.imu.stamps_ns, rate, force), world.dvl, known)
+    assert (found is None) if told is None else (told in (found or ""))
+    assert gyro_warning(Imu(world.imu.stamps_ns, rate, np.full_like(force, np.nan)), world.dvl, known) is None
 
 
 def moving(*stretches: tuple[slice, Any], rows: int = 300) -> Floats:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sonar_graph.calibration import Calibration
+from sonar_graph.calibration import Calibration, Start
 from sonar_graph.errors import CalibrationError, LogError, MissingTopicError
 from sonar_graph.logs.adapters.landmark_messages import LandmarkMapAdapter, detection_warnings
 from sonar_graph.logs.cdr.definitions import definition
@@ -220,7 +220,8 @@ RANGE, COVARIANCE = "a range that is not above 0 and at most 100 km", "a covaria
 TOLD: dict[str, tuple[dict[str, Any], int, str]] = {
     "sound": ({}, 3, ""),
     "largest identity": ({"candidate_ids": [5, 2**56 - 1]}, 3, ""),
-    "unknown covariance": ({"covariance": [np.nan] * 8, "track": [3, 4]}, 3, ""),
+    "unknown covariance": ({"covariance": [np.nan] * 8, "track": [3, 4]}, 3, "2 of 3 rows say no covariance"),
+    "degrees": ({"azimuth_rad": [-40.0, 1.0]}, 3, "1 of 3 rows have an azimuth beyond ±3.14 rad (up to 40)"),
     "97 %": ({"id_probability": [97.0, 0.5]}, 2, POSTERIOR),
     "negative": ({"id_probability": [0.5, -0.1]}, 2, POSTERIOR),
     "above 1": ({"id_probability": [1.1, 0.5]}, 2, POSTERIOR),
@@ -273,6 +274,8 @@ def test_a_covariance_is_told_of_where_estimators_refuse_it(cross: float) -> Non
 def long(make_sequence: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Path]:
     """A sequence of several chunks and its log, which is not to be written to."""
     sequence = make_sequence(samples=20_000)
+    stated = sequence.calibration.model_copy(update={"start": Start(position_m=(0.0, 0.0, 0.0))})
+    sequence = replace(sequence, calibration=stated)
     path = tmp_path_factory.mktemp("long") / "a.mcap"
     write_log(path, sequence)
     return sequence, path

@@ -1,6 +1,7 @@
 """Where a calibration comes from: mountings of ``/tf_static``, the record of the log, and the user's file."""
 
 import json
+from dataclasses import replace
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonar_graph.calibration import Calibration, DepthCalibration, DvlCalibration, ImuCalibration, Mounting
+from sonar_graph.calibration import Calibration, DepthCalibration, DvlCalibration, ImuCalibration, Mounting, Start
 from sonar_graph.errors import CalibrationError, LogError
 from sonar_graph.logs.mcap.reader import scan
 from sonar_graph.logs.mcap.topic import Keep
@@ -169,6 +170,17 @@ def test_a_sensor_mounted_by_the_file_is_not_told_to_be_missing(bench: Any) -> N
         assert ("dvl (dvl_link)" in notes["log.calibration"]) is not is_said
         assert ("z downwards" in notes.get("log.warnings", "")) is not is_said
         assert "imu (imu_link)" in notes["log.calibration"]
+
+
+@pytest.mark.parametrize("calibration", [Calibration(), Calibration(start=Start())], ids=["no start", "the default"])
+def test_a_start_is_stated_in_a_log_that_was_read_where_somebody_stated_it(
+    make_sequence: Any, tmp_path: Path, calibration: Calibration
+) -> None:
+    write_log(tmp_path / "log.mcap", replace(make_sequence(), calibration=calibration))
+    again = read_log(tmp_path / "log.mcap").calibration
+    assert again == calibration
+    assert ("start" in again.model_fields_set) == ("start" in calibration.model_fields_set)
+    assert ("position_m" in again.start.model_fields_set) == ("start" in calibration.model_fields_set)
 
 
 def test_a_section_is_completed_by_the_log_or_taken_away_by_false() -> None:

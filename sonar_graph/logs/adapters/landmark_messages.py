@@ -261,7 +261,6 @@ def detection_warnings(detections: LandmarkDetections, first_ns: int, last_ns: i
     is_range, is_azimuth = possible_ranges(detections.range_m), np.abs(detections.azimuth_rad) <= FULL_TURN_RAD
     faults = {
         "a range that is not above 0 and at most 100 km": ~is_range,
-        "an azimuth beyond a full turn (of radians; are they degrees?)": ~is_azimuth,
         "a covariance that is not positive definite": is_range & is_azimuth & ~detections.are_sound(),
         "a stamp before the first odometry": detections.stamps_ns < first_ns,
         "a stamp after the last odometry": detections.stamps_ns > last_ns,
@@ -273,7 +272,7 @@ def detection_warnings(detections: LandmarkDetections, first_ns: int, last_ns: i
     if beyond:
         yield (
             f"{beyond} of {len(detections)} rows have an azimuth beyond ±3.14 rad (up to "
-            f"{np.abs(detections.azimuth_rad).max():.3g}): degrees? They are taken as rad"
+            f"{np.abs(detections.azimuth_rad).max():.3g}): degrees? Beyond a full turn they are not used"
         )
     tracked = detections.track != NO_TRACK
     pairs = np.column_stack((detections.stamps_ns[tracked], detections.track[tracked]))

@@ -62,10 +62,12 @@ class ImuAdapter(Adapter):
         return (Imu(table.stamps_ns[rows], rate, force) if rows.size else None), dropped
 
     def warnings(self, table: MessageTable) -> Iterator[str]:
-        """Warning about a specific force that the driver does not fill."""
+        """Warning about a specific force that the driver does not fill, or fills with what is no number."""
+        names, bad = ", ".join(self.linear_acceleration), not_finite(table.beside(self.linear_acceleration))
         if self._is_force_unfilled(table):
-            names = ", ".join(self.linear_acceleration)
             yield f"{names} are 0 in every message, which no accelerometer measures: taken as not measured"
+        elif bad.any() and not bad.all():
+            yield f"{names} are not finite in {bad.sum()} of {len(table)} messages: taken as not measured there"
 
     def _is_force_unfilled(self, table: MessageTable) -> bool:
         """Tell whether the force is zero in all messages, which not even free fall gives."""

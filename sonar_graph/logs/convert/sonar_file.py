@@ -24,7 +24,7 @@ from sonar_graph.calibration import Calibration, SonarCalibration, SonarImage
 from sonar_graph.errors import DatasetError
 from sonar_graph.images import SonarFrames
 from sonar_graph.logs.mcap import Progress, recording
-from sonar_graph.logs.vehicle_setup import METADATA
+from sonar_graph.logs.vehicle_setup import METADATA, recorded_calibration
 from sonar_graph.logs.writing import sonar_image_messages
 from sonar_graph.measurements import Floats
 
@@ -329,7 +329,7 @@ def convert_sonar_file(
     """Write all whole frames to an MCAP log; memory holds a few of them at a time."""
     conversion = SonarConversion(promised=kind.frames_promised)
     calibration = Calibration(sonar=SonarCalibration(image=kind.image))
-    record = {"name": source.path.stem, "calibration": calibration.model_dump_json()}
+    record = {"name": source.path.stem, "calibration": recorded_calibration(calibration)}
     with recording(output, {METADATA: record | {"notes": json.dumps(dict(kind.notes))}}) as out:
         for block in _blocks(frames_and_losses(source, kind), kind.clock_period_ns, conversion):
             heads, stamps_ns = zip(*block, strict=True)
