@@ -229,8 +229,8 @@ def gyro_warning(imu: Imu, dvl: Dvl, calibration: Calibration) -> str | None:
     if not apart[best] < as_is_mrad / MOST_IMPROVED:
         return None
     return (
-        f"gravity and velocity turn, by {apart[best]:.2g} mrad a second instead of {as_is_mrad:.2g}, as gyro rates about "
-        f"the axes ({best}) would: give rotation, the IMU's mounting, or angular_velocity_scale = -1"
+        f"gravity and velocity turn, by {apart[best]:.2g} mrad a second instead of {as_is_mrad:.2g}, as gyro rates "
+        f"about the axes ({best}) would: give rotation, the IMU's mounting, or angular_velocity_scale = -1"
     )
 
 

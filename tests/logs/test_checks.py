@@ -306,3 +306,4 @@ def test_rows_that_do_not_say_their_noise_are_counted() -> None:
         "depth: 1 of 5 rows say no covariance, depth.sigma_m of the calibration count",
         "detections: 5 of 5 rows say no covariance, sonar.range_sigma_m and azimuth_sigma_rad of the calibration count",
     ]
+    assert [text.partition(":")[0] for text in unsaid_noise(blocks, only_partly=True)] == ["dvl", "depth"]
