@@ -13,10 +13,17 @@ from typing import Any
 
 from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation.consistency import error_series
+from sonar_graph.evaluation.own_map import shared_map_instants
 from sonar_graph.evaluation.results import Comparison, ErrorSeries, Kind, RunResult, Score
 from sonar_graph.evaluation.run import check_request, run_estimator
 from sonar_graph.evaluation.scored_instants import rows_at, scored_instants
-from sonar_graph.evaluation.scores import detection_scores, landmark_scores, resource_scores, trajectory_scores
+from sonar_graph.evaluation.scores import (
+    detection_scores,
+    landmark_scores,
+    own_map_scores,
+    resource_scores,
+    trajectory_scores,
+)
 from sonar_graph.measurements import Ints
 from sonar_graph.sequence import Sequence, require_sequence
 from sonar_graph.states import Trajectory
@@ -126,7 +133,7 @@ def judge(sequence: Sequence, instants_ns: Ints, runs: list[RunResult]) -> Compa
     for run in ended:
         own = scores[run.estimator] = resource_scores(run, sequence.duration_s)
         if run.landmarks is not None:
-            own |= landmark_scores(run.landmarks, sequence.true_landmarks)
+            own |= landmark_scores(run.landmarks, sequence)
         if run.detections is not None:
             own |= detection_scores(run.detections)
     comparison = Comparison(sequence, instants_ns, runs, scores, errors, environment)
@@ -149,4 +156,7 @@ def judge(sequence: Sequence, instants_ns: Ints, runs: list[RunResult]) -> Compa
             estimate = rows_at(trajectory, scored.stamps_ns)
             series = errors[run.estimator][kind] = error_series(estimate, truth, position_dof)
             scores[run.estimator] |= trajectory_scores(kind, estimate, truth, series, str(scored))
+    map_instants_ns = shared_map_instants(ended, sequence, scored.stamps_ns)
+    for run in ended:
+        scores[run.estimator] |= own_map_scores(run, sequence, map_instants_ns)
     return comparison

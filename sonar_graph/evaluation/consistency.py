@@ -20,6 +20,8 @@ from sonar_graph.measurements import Floats, Ints, LandmarkDetections
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import DetectionLog, Outcome, Trajectory
 
+LEAST_SAMPLES = 10
+"""With fewer independent samples a small normalised error is no sign of caution: slow errors pass through zero."""
 GATED_SHARE = 0.2
 """Above this share of detections outside its gate an estimator is lost, or its noise is far too small; the innovations
 inside the gate then say nothing about its covariances."""
@@ -51,6 +53,8 @@ def error_series(estimate: Trajectory, truth: Trajectory, position_dof: int) -> 
         nees_position=normalised_squares(position_error[:, axes], position_cov[:, axes, axes]),
         nees_yaw=normalised_squares(yaw_error[:, None], yaw_var[:, None, None]),
         position_dof=position_dof,
+        position_samples=effective_samples(normalised(position_error[:, axes], position_cov[:, axes, axes])),
+        yaw_samples=effective_samples(normalised(yaw_error[:, None], yaw_var[:, None, None])),
     )
 
 
@@ -78,13 +82,54 @@ def yaw_variances(trajectory: Trajectory) -> Floats:
 
 def normalised_squares(errors: Floats, covs: Floats) -> Floats:
     """``e^T P^-1 e`` of every row of (n, d) and (n, d, d); NaN where P is unknown or not positive definite."""
-    squares = np.full(len(errors), np.nan)
+    return np.asarray((normalised(errors, covs) ** 2).sum(axis=1))
+
+
+def normalised(errors: Floats, covs: Floats) -> Floats:
+    """``P^-1/2 e`` of every row, shape (n, d); NaN where P is unknown or not positive definite."""
+    unit = np.full(errors.shape, np.nan)
     known = np.isfinite(covs).all(axis=(1, 2)) & np.isfinite(errors).all(axis=1)
     variances, axes = np.linalg.eigh(covs[known])
     along = np.einsum("nji,nj->ni", axes, errors[known])
     definite = variances[:, 0] > 0 if len(variances) else np.zeros(0, dtype=bool)
-    squares[np.flatnonzero(known)[definite]] = (along[definite] ** 2 / variances[definite]).sum(axis=1)
-    return squares
+    scaled = along[definite] / np.sqrt(variances[definite])
+    unit[np.flatnonzero(known)[definite]] = np.einsum("nij,nj->ni", axes[definite], scaled)
+    return unit
+
+
+def effective_samples(unit: Floats) -> int:
+    """Number of independent samples that the mean square of a series of normalised errors, shape (n, d), is worth.
+
+    With the correlation C_k of the errors k rows apart (Bayley, Hammersley 1946; for squares of Gaussian errors)::
+
+        N = n / (1 + 2 sum_k (1 - k/n) |C_k|^2 / d),    C_k = sum_i u_i u_{i+k}^T / (n - k) / mean |u|^2 d
+
+    The sum ends at the first lag that is within two standard errors, 4/n, of none. No mean is subtracted: a consistent
+    error has none, and a constant error is one sample. At least 1; 0 where no covariance is known.
+    """
+    u = unit[np.isfinite(unit).all(axis=1)]
+    n, d = u.shape
+    if not n or not u.any():
+        return min(n, 1)
+    spectrum = np.fft.rfft(u, 2 * n, axis=0)
+    sums = np.fft.irfft(np.einsum("fi,fj->fij", spectrum.conj(), spectrum), 2 * n, axis=0)[:n]
+    lag = np.arange(n)
+    C = sums / (n - lag)[:, None, None] / (np.mean(u**2))
+    shared = np.minimum((C**2).sum(axis=(1, 2)) / d, 1.0)
+    gone = np.flatnonzero(shared < 4 * d / n)
+    last = gone[0] if gone.size else n
+    return max(1, int(n / (1 + 2 * np.sum((1 - lag[1:last] / n) * shared[1:last]))))
+
+
+def time_average_interval(samples: int, dof: int) -> tuple[float, float] | None:
+    """Bounds of the average of one run that is worth so many independent samples; None for none.
+
+    With fewer than `LEAST_SAMPLES` the lower bound is 0.
+    """
+    if not samples:
+        return None
+    low, high = anees_interval(samples, dof)
+    return low if samples >= LEAST_SAMPLES else 0.0, high
 
 
 def nis(log: DetectionLog) -> Floats:

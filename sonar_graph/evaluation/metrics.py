@@ -7,6 +7,8 @@ interpolates a truth there. Maps are compared by identity. Landmarks of unknown 
 are first matched to the true ones by their place.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,12 +16,19 @@ from scipy.optimize import linear_sum_assignment
 
 from sonar_graph.errors import EvaluationError
 from sonar_graph.measurements import NS_PER_S, Floats, Ints
+from sonar_graph.sequence import Sequence
 from sonar_graph.states import FIRST_ANONYMOUS_ID, LandmarkMap, Trajectory
 
 PAIRING_TOLERANCE = 0.01
 """A pair for the relative error may be this fraction of the delta longer or shorter than it."""
 FARTHEST_M = 1.0
 """Largest horizontal distance at which a landmark of unknown identity is matched to a true one."""
+OUTLYING = 3 * 1.4826
+"""Residuals above this many times their median are outliers: three sigmas of a normal distribution."""
+CONCENTRATIONS = 10
+"""Fits to the better half."""
+LEAST_OUTVOTING = 5
+"""With fewer landmarks none can be told to be the outlier."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +43,15 @@ class Alignment:
     def apply(self, points: Floats) -> Floats:
         """Points moved into the truth's world, shape (n, 3)."""
         return np.asarray(points @ self.rotation.T + self.translation)
+
+    def map(self, landmarks: LandmarkMap) -> LandmarkMap:
+        """Landmarks moved into the truth's world, with their covariances."""
+        R = self.rotation
+        return LandmarkMap(landmarks.ids, self.apply(landmarks.positions), R @ landmarks.covariances @ R.T)
+
+    def inverse(self) -> Alignment:
+        """The motion of the truth's world into the estimate's."""
+        return Alignment(self.rotation.T, -self.rotation.T @ self.translation)
 
 
 def umeyama(points: Floats, targets: Floats) -> tuple[Floats, Floats]:
@@ -221,9 +239,60 @@ def check_paired(estimate: Trajectory, truth: Trajectory) -> None:
         )
 
 
-def anonymous_named(estimated: LandmarkMap, true: LandmarkMap | None) -> LandmarkMap:
-    """The map as it is scored: landmarks of unknown identity get that of the true one within `FARTHEST_M`."""
-    return estimated if true is None else named_by_place(estimated, true, FARTHEST_M)
+@dataclass(frozen=True, eq=False)
+class ScoredMap:
+    """A map as it is scored against the true landmarks."""
+
+    landmarks: LandmarkMap
+    """In the world of the true landmarks; unknown identities are those of the true ones within `FARTHEST_M`."""
+    alignment: Alignment | None
+    """By which it got there; None where the world of the start pose is that of the true landmarks."""
+
+
+def scored_map(estimated: LandmarkMap, sequence: Sequence) -> ScoredMap | None:
+    """The map in the world of the true landmarks; None without these, or where it cannot be brought there.
+
+    With a true path the start pose is in its world, and so are the landmarks. Landmarks surveyed without a
+    path are in a world of their own, into which the map is aligned by the landmarks that both name.
+    """
+    true = sequence.true_landmarks
+    if true is None:
+        return None
+    alignment = None
+    if sequence.truth is None or not len(sequence.truth):
+        calibration = sequence.calibration
+        is_level = calibration.planar is not None or calibration.use_gravity
+        alignment = align_map(estimated, true, is_level=is_level)
+        if alignment is None:
+            return None
+        estimated = alignment.map(estimated)
+    return ScoredMap(named_by_place(estimated, true, FARTHEST_M), alignment)
+
+
+def align_map(estimated: LandmarkMap, true: LandmarkMap, *, is_level: bool = True) -> Alignment | None:
+    """The alignment of a map to the true one by the landmarks that both name; None for fewer than needed.
+
+    By yaw and translation where the estimate is level (two landmarks), else by SE(3) (three). Landmarks that lie far
+    outside the fit of the others, such as those of a wrong identity, are left out (least trimmed squares, Rousseeuw and
+    Van Driessen 2006: fits to the better half, then to all within `OUTLYING`).
+    """
+    _, rows, true_rows = np.intersect1d(estimated.ids, true.ids, return_indices=True)
+    points, targets = estimated.positions[rows], true.positions[true_rows]
+    fit = align_yaw if is_level else align_se3
+    if len(points) < (2 if is_level else 3):
+        return None
+    alignment = fit(points, targets)
+    if len(points) < LEAST_OUTVOTING:
+        return alignment
+
+    def residuals(found: Alignment) -> Floats:
+        return np.asarray(np.linalg.norm((found.apply(points) - targets)[:, :2], axis=1))
+
+    for _ in range(CONCENTRATIONS):
+        better = np.argsort(residuals(alignment), kind="stable")[: (len(points) + 3) // 2]
+        alignment = fit(points[better], targets[better])
+    near = residuals(alignment) <= OUTLYING * np.median(residuals(alignment))
+    return fit(points[near], targets[near])
 
 
 def named_by_place(estimated: LandmarkMap, true: LandmarkMap, farthest_m: float) -> LandmarkMap:

@@ -20,7 +20,7 @@ from sonar_graph.states import DetectionLog, LandmarkMap, Refusal, RefusedRow, T
 
 Kind = Literal["causal", "smoothed"]
 TOLERATED_FACTOR = 2.0
-"""Distance from 1, as a factor, from which a normalised squared error without an interval is called inconsistent."""
+"""An interval that reaches beyond this factor of 1 is too wide to call a value inside it consistent."""
 MOST_ROWS_NAMED = 5
 """Refused rows of one sensor and reason that are named one by one, and messages of one run that are shown."""
 
@@ -65,7 +65,7 @@ class RunResult:
     withheld: list[str] = field(default_factory=list)
     """Measurements that it could not use because something else is missing, in its own words, a line each."""
     maps: list[MapSoFar] = field(default_factory=list)
-    """The map at `map_instants`, in order; the last one is `landmarks`."""
+    """The map at `kept_map_instants`, in order; the last one is `landmarks`."""
     update_s: Floats = field(default_factory=lambda: np.empty(0))
     """Duration of each call of `process`, shape (n,)."""
     finish_s: float = 0.0
@@ -110,18 +110,17 @@ class Score:
     def verdict(self) -> str:
         """The verdict of a normalised squared error on the reported covariances; empty for other scores.
 
-        Above the score's interval, or where it has none above `TOLERATED_FACTOR`, the estimator is over-confident;
-        below the interval, or the factor's inverse, over-cautious. Inside the interval it is consistent. Inside the
-        factor nothing is said: one run proves little.
+        Above the score's interval the estimator is over-confident, below it over-cautious. Inside it is consistent,
+        unless the interval is wider than `TOLERATED_FACTOR`: then, and without an interval, nothing is said.
         """
-        if self.better != "inside" or math.isnan(self.value):
+        if self.better != "inside" or math.isnan(self.value) or self.interval is None:
             return ""
-        lowest, highest = self.interval or (1 / TOLERATED_FACTOR, TOLERATED_FACTOR)
+        lowest, highest = self.interval
         if self.value > highest:
             return "over-confident"
         if self.value < lowest:
             return "over-cautious"
-        return "consistent" if self.interval else ""
+        return "consistent" if highest <= TOLERATED_FACTOR else ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,6 +143,10 @@ class ErrorSeries:
     """Shape (n,)."""
     position_dof: int
     """2 for a planar run, else 3."""
+    position_samples: int
+    """Number of independent samples that the mean of ``nees_position`` is worth."""
+    yaw_samples: int
+    """The same of ``nees_yaw``."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -19,7 +19,7 @@ from sonar_graph.calibration import Section
 from sonar_graph.errors import EstimatorError, EvaluationError, UnknownEstimatorError
 from sonar_graph.estimator import Estimator, load_estimator, make_params, refused_rows_of, withheld_of
 from sonar_graph.evaluation.results import MapSoFar, RunResult
-from sonar_graph.evaluation.scored_instants import map_instants
+from sonar_graph.evaluation.scored_instants import kept_map_instants
 from sonar_graph.measurements import Floats, Ints, LandmarkDetections, Measurements
 from sonar_graph.sequence import Sequence, require_sequence
 from sonar_graph.states import Estimate, LandmarkMap, RefusedRow, Trajectory
@@ -127,8 +127,8 @@ def run_estimator(
 
     The log is cut into steps before the clock starts, and a second instance of the estimator takes the first of them,
     so that first calls are not counted; time in which numba compiles later is taken off. Only calls of the estimator
-    are timed. The map is kept at `map_instants`; asking for it before the end is not timed. The estimator gets a copy
-    of the measurements, so that one that changes them does not change those of the next.
+    are timed. The map is kept at `kept_map_instants`; asking for it before the end is not timed. The estimator gets a
+    copy of the measurements, so that one that changes them does not change those of the next.
 
     Parameters
     ----------
@@ -203,7 +203,7 @@ class _Replay:
         self._estimates: list[Estimate] = []
         self._update_s: list[float] = []
         ends_ns = np.array([step.end_ns for step in steps], dtype=np.int64)
-        interim_ns = map_instants(ends_ns, sequence.start_ns).tolist()[:-1]
+        interim_ns = kept_map_instants(ends_ns, sequence.start_ns).tolist()[:-1]
         self._map_at_ns = set(interim_ns if interim_maps else [])
         self._maps: list[MapSoFar] = []
         self._stage = "at the start"

@@ -25,6 +25,8 @@ RETURN_M = (-0.3013, -0.1758)
 DURATION_S = 2039.0
 MAP_TIMES_S = (833.1, 1369.4, 2039.0)
 """Times of path and map in Fig. 4."""
+MAPS_KEPT = 20
+"""Instants, evenly over the run, at which maps are kept beside those of Fig. 4: each costs a smoother a solution."""
 SAME_PLACE_M = 1e-3
 """A true landmark this near to the published one in x and in y is that landmark."""
 TRUTH_GAP_S = 0.5
@@ -109,6 +111,12 @@ def map_instants(asked_ns: Ints, start_ns: int) -> Ints:
         return asked_ns
     wanted_ns = start_ns + (asked_ns[-1] - start_ns) * np.array(MAP_TIMES_S) / DURATION_S
     return np.unique(asked_ns[np.abs(asked_ns[None, :] - wanted_ns[:, None]).argmin(axis=1)])
+
+
+def kept_map_instants(asked_ns: Ints, start_ns: int) -> Ints:
+    """The `map_instants`, and `MAPS_KEPT` others at equal distances."""
+    rows = np.linspace(0, len(asked_ns), MAPS_KEPT + 1)[1:].astype(np.int64) - 1
+    return np.union1d(map_instants(asked_ns, start_ns), asked_ns[rows[rows >= 0]])
 
 
 def gap_limit_s(truth: Trajectory) -> float:

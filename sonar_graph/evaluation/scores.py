@@ -5,10 +5,16 @@ from collections import Counter
 
 import numpy as np
 
-from sonar_graph.evaluation.consistency import GATED_SHARE, anees_interval, mean_normalised, nis, normalised_squares
+from sonar_graph.evaluation.consistency import (
+    GATED_SHARE,
+    anees_interval,
+    mean_normalised,
+    nis,
+    normalised_squares,
+    time_average_interval,
+)
 from sonar_graph.evaluation.metrics import (
     FARTHEST_M,
-    anonymous_named,
     ate_raw_m,
     ate_se2_m,
     ate_se3_m,
@@ -17,9 +23,13 @@ from sonar_graph.evaluation.metrics import (
     relative_errors,
     return_error_m,
     rmse,
+    scored_map,
     yaw_errors_rad,
 )
+from sonar_graph.evaluation.own_map import LEAST_LANDMARKS, own_map_errors
 from sonar_graph.evaluation.results import ErrorSeries, Kind, RunResult, Score
+from sonar_graph.measurements import Ints
+from sonar_graph.sequence import Sequence
 from sonar_graph.states import DetectionLog, LandmarkMap, Outcome, Trajectory
 
 RELATIVE_DELTAS_S = (1, 10)
@@ -33,7 +43,9 @@ USED = {
     *(Outcome.PLACED_LATER, Outcome.MOVED, Outcome.REASSIGNED),
 }
 """Outcomes of detections that are in the estimate."""
-IN_TIME = "instants of one run are correlated, so no band is given for their average"
+IN_TIME = (
+    "errors of successive instants are correlated: their mean is worth {} independent samples, for which the band is"
+)
 
 
 def trajectory_scores(
@@ -69,27 +81,28 @@ def trajectory_scores(
         )
     axes = "x and y" if errors.position_dof == 2 else "x, y and z"
     parts = (
-        ("nees_position", errors.nees_position, errors.position_dof, f"position ({axes})"),
-        ("nees_yaw", errors.nees_yaw, 1, "heading"),
+        ("nees_position", errors.nees_position, errors.position_dof, errors.position_samples, f"position ({axes})"),
+        ("nees_yaw", errors.nees_yaw, 1, errors.yaw_samples, "heading"),
     )
-    for key, nees, dof, what in parts:
+    for key, nees, dof, samples, what in parts:
         known, mean = int(np.isfinite(nees).sum()), mean_normalised(nees, dof)
         if not math.isfinite(mean):
             continue
         protocol = (
             f"{which}, not aligned: mean normalised squared error of {what} divided by {dof}, {over}, {known} of which "
-            f"have a covariance; 1 is consistent, above is over-confident; {IN_TIME}."
+            f"have a covariance; 1 is consistent; {IN_TIME.format(samples)}."
         )
-        scores[key] = Score(mean, "1", protocol, better="inside")
+        scores[key] = Score(mean, "1", protocol, time_average_interval(samples, dof), better="inside")
     return {f"{kind}.{key}": score for key, score in scores.items()}
 
 
-def landmark_scores(estimated: LandmarkMap, true: LandmarkMap | None) -> dict[str, Score]:
+def landmark_scores(estimated: LandmarkMap, sequence: Sequence) -> dict[str, Score]:
     """The final map against the true one, where there is one."""
     count = Score(float(len(estimated)), "1", "Landmarks in the map at the end.", better="none")
-    if true is None:
+    true, scored = sequence.true_landmarks, scored_map(estimated, sequence)
+    if true is None or scored is None:
         return {"landmarks.count": count}
-    named = anonymous_named(estimated, true)
+    named, is_aligned = scored.landmarks, scored.alignment is not None
     errors = landmark_errors(named, true)
     if not len(errors):
         return {"landmarks.count": count}
@@ -98,19 +111,40 @@ def landmark_scores(estimated: LandmarkMap, true: LandmarkMap | None) -> dict[st
     which = f"Map at the end, {len(errors)} landmarks matched {how} ({len(true)} true, {len(estimated)} estimated)"
     nees = normalised_squares(errors.horizontal_m, errors.horizontal_covs)
     se2 = "aligned by SE(2) without scale fitted to the landmarks: rms of horizontal error"
-    consistency = "mean normalised squared horizontal error divided by 2; 1 is consistent; landmarks of one map are"
+    where = (
+        "aligned, since without a true path the world of the landmarks is not that of the start"
+        if is_aligned
+        else ("not aligned")
+    )
+    dof = 2 * len(errors) - (3 if is_aligned else 0)
     scores = {
-        "landmarks.raw_m": Score(rmse(errors.horizontal_m), "m", f"{which}, not aligned: rms of horizontal error."),
         "landmarks.se2_m": Score(errors.aligned_rmse_m, "m", f"{which}, {se2}."),
         "landmarks.count": count,
         "landmarks.nees": Score(
-            mean_normalised(nees, 2),
+            float(nees.sum() / dof) if dof else math.nan,
             "1",
-            f"{which}, not aligned: {consistency} correlated, so no band is given.",
+            f"{which}, {where}: sum of normalised squared horizontal errors divided by {dof}; 1 is consistent; "
+            "landmarks of one map are correlated, so no band is given.",
             better="inside",
         ),
     }
+    if not is_aligned:
+        raw = Score(rmse(errors.horizontal_m), "m", f"{which}, not aligned: rms of horizontal error.")
+        scores = {"landmarks.raw_m": raw, **scores}
     return _finite(scores)
+
+
+def own_map_scores(run: RunResult, sequence: Sequence, instants_ns: Ints) -> dict[str, Score]:
+    """The causal position on the run's own map at instants that all runs with a map share."""
+    stamps_ns, errors_m = own_map_errors(run, sequence, instants_ns)
+    if not len(stamps_ns):
+        return {}
+    rule = (
+        f"Causal estimate at {len(stamps_ns)} instants, moved by the alignment of the estimator's map as it was then to "
+        "the true landmarks: rms of horizontal position error; of the instants at which maps are kept those at which "
+        f"every estimator with a map knows {LEAST_LANDMARKS} landmarks."
+    )
+    return {"causal.own_map_m": Score(rmse(errors_m), "m", rule)}
 
 
 def detection_scores(log: DetectionLog) -> dict[str, Score]:

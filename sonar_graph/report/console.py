@@ -5,11 +5,12 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from sonar_graph.evaluation import ABSENT, LABELS, TOLERATED_FACTOR, Comparison, repeats_published, score_keys
+from sonar_graph.evaluation import ABSENT, LABELS, Comparison, repeats_published, score_keys
 from sonar_graph.report import sentences
 from sonar_graph.report.landmark_table import PAPER, landmark_table
 
 COLUMNS = {
+    "causal.own_map_m": "on own\nmap",
     "causal.yaw_rmse_rad": "yaw",
     "causal.nees_position": "NEES\npos.",
     "causal.nees_yaw": "NEES\nyaw",
@@ -18,7 +19,8 @@ COLUMNS = {
 }
 """Columns after the two position errors; those that no run has are left out."""
 NEES_LEGEND = (
-    f"NEES: 1 fits; ▲ above {TOLERATED_FACTOR:g} over-confident, ▼ below {1 / TOLERATED_FACTOR:g} over-cautious"
+    "NEES: 1 fits; ▲ over-confident, ▼ over-cautious: outside what 95 % of consistent runs with as many independent "
+    "samples have (the report has the bands)"
 )
 RECOGNISED_BEFORE = (
     "Sonar images: the detections are those that recognise put into the log; for pictures and outcomes in the report "
@@ -46,7 +48,8 @@ def summary(comparison: Comparison) -> Group:
     metric = sentences.headline_metric(comparison)
     errors = {f"causal.{metric}": "causal", f"smoothed.{metric}": "smoothed"} if metric else {}
     present = score_keys(comparison)
-    columns = {key: heading for key, heading in {**errors, **COLUMNS}.items() if key in present}
+    mapped = {} if metric else {"landmarks.se2_m": "map"}
+    columns = {key: heading for key, heading in {**errors, **mapped, **COLUMNS}.items() if key in present}
     table = Table(title=Text(comparison.sequence.name, style="bold"), title_justify="left")
     table.box, table.padding = SIMPLE_HEAD, (0, 1, 0, 0)
     table.add_column("estimator", no_wrap=True)
@@ -82,8 +85,11 @@ def _lines_below(comparison: Comparison, metric: str | None) -> list[str]:
     if not has_detections:
         lines.append(sentences.no_detections(comparison))
     if metric is None:
-        return [*lines, "No position errors: the report says why."]
-    lines += [f"causal, smoothed: {LABELS[metric]}", NEES_LEGEND]
+        mapped = f"map: {LABELS['se2_m']}" if "landmarks.se2_m" in score_keys(comparison) else ""
+        return [*lines, *filter(None, [mapped]), "No position errors: the report says why."]
+    lines += [f"causal, smoothed: {LABELS[metric]}"]
+    lines += [f"on own map: {LABELS['own_map_m']}"] if "causal.own_map_m" in score_keys(comparison) else []
+    lines.append(NEES_LEGEND)
     for name in (run.estimator for run in comparison.runs):
         score = comparison.score_of(name, "causal.nees_position")
         is_odometry = name == "dead-reckoning" or not has_detections

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from sonar_graph.evaluation import Comparison, Reliability, RunResult, nis, yaw_rad
+from sonar_graph.evaluation import Comparison, Reliability, RunResult, nis, own_map_errors, yaw_rad
 from sonar_graph.measurements import Floats
 from sonar_graph.report import figure_style as style
 from sonar_graph.states import DetectionLog, Outcome, Trajectory
@@ -61,6 +61,24 @@ def error_figure(comparison: Comparison) -> Figure | None:
             panel.axhline(0.0, color=style.MUTED, linewidth=0.7)
             panel.plot(seconds[rows], error[rows], color=style.colour(index), linewidth=1.1)
             style.name_axes(panel, TIME_LABEL if row == len(labels) - 1 else "", "" if column else label)
+    return figure
+
+
+def own_map_figure(comparison: Comparison) -> Figure | None:
+    """Causal position error of each run on the map that it had at that instant."""
+    found = [own_map_errors(run, comparison.sequence, comparison.instants_ns) for run in comparison.runs]
+    if not any(len(stamps_ns) for stamps_ns, _ in found):
+        return None
+    figure, axes = style.blank_panels(1, 1, SINGLE_IN)
+    panel: Axes = axes[0, 0]
+    for index, (stamps_ns, errors_m) in enumerate(found):
+        if len(stamps_ns):
+            seconds = style.seconds_since_start(comparison, stamps_ns)
+            look = {"color": style.colour(index), "linestyle": style.line_style(index), "linewidth": 1.3}
+            panel.plot(seconds, errors_m, marker="o", markersize=3.5, label=comparison.runs[index].estimator, **look)
+    panel.set_ylim(bottom=0.0)
+    style.name_axes(panel, TIME_LABEL, "error on its own map (m)")
+    style.legend_above(figure, panel)
     return figure
 
 

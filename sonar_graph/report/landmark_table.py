@@ -14,12 +14,12 @@ from sonar_graph.evaluation import (
     Column,
     Comparison,
     Table,
-    anonymous_named,
     fixed,
     landmark_errors,
     published_maps,
     repeats_published,
     rmse,
+    scored_map,
     words,
 )
 from sonar_graph.measurements import Floats
@@ -49,7 +49,7 @@ def coordinate(landmarks: LandmarkMap | None, identity: int, axis: int) -> float
 
 
 def landmark_table(comparison: Comparison) -> Table | None:
-    """The final maps of the runs against the true one, not aligned; None where no run has mapped a landmark.
+    """The final maps of the runs against the true one, as scored; None where no run has mapped a landmark.
 
     Columns: quantity, true value (where the true landmarks are known), each run with a map, and the paper where its
     experiment is repeated (then also runs with a path only). Rows: x and y of each landmark; below a section heading
@@ -57,11 +57,12 @@ def landmark_table(comparison: Comparison) -> Table | None:
     """
     runs, true = comparison.runs, comparison.sequence.true_landmarks
     repeats = repeats_published(comparison.sequence)
-    mapped = {
-        run.estimator: anonymous_named(run.landmarks, true)
-        for run in runs
-        if run.landmarks is not None and len(run.landmarks)
-    }
+    mapped, is_aligned = {}, False
+    for run in runs:
+        if run.landmarks is not None and len(run.landmarks):
+            scored = scored_map(run.landmarks, comparison.sequence)
+            mapped[run.estimator] = run.landmarks if scored is None else scored.landmarks
+            is_aligned |= scored is not None and scored.alignment is not None
     columns = {name: MapColumn(landmarks) for name, landmarks in mapped.items()}
     if repeats:
         walked = {run.estimator: run.causal for run in runs if run.causal is not None and len(run.causal)}
@@ -83,7 +84,8 @@ def landmark_table(comparison: Comparison) -> Table | None:
         errors = [None if one.landmarks is None else landmark_errors(one.landmarks, true) for one in columns.values()]
         raw = [fixed(rmse(e.horizontal_m), DECIMALS) if e else ABSENT for e in errors]
         aligned = [ABSENT if not e or np.isnan(e.aligned_rmse_m) else fixed(e.aligned_rmse_m, DECIMALS) for e in errors]
-        rows += [["RMS, not aligned", "", *raw], ["RMS after SE(2) alignment", "", *aligned]]
+        rows += [] if is_aligned else [["RMS, not aligned", "", *raw]]
+        rows.append(["RMS after SE(2) alignment", "", *aligned])
         if repeats:
             rows += _return_rows(comparison.sequence.truth, [column.path for column in columns.values()])
     heads = [Column("quantity", "Quantity", is_number=False), Column("true", "true")]
@@ -91,6 +93,8 @@ def landmark_table(comparison: Comparison) -> Table | None:
     if true is None:
         heads, rows = [heads[0], *heads[2:]], [[row[0], *row[2:]] for row in rows]
     caption = "Positions in the map at the end, metres" + ("" if true is None else "; in brackets estimate minus truth")
+    if is_aligned:
+        caption += "; maps aligned to the true landmarks, whose world is not that of the start"
     return Table("landmarks", caption, "", heads, [[words(text) for text in row] for row in rows], sections)
 
 

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from scipy.stats import chi2
 
-from sonar_graph.evaluation import Comparison, RunResult
-from sonar_graph.measurements import Floats
+from sonar_graph.evaluation import Comparison, RunResult, map_instants, scored_map
+from sonar_graph.measurements import Floats, Ints
 from sonar_graph.report import figure_style as style
 from sonar_graph.states import LandmarkMap, Trajectory
 
@@ -42,7 +42,7 @@ def map_figure(comparison: Comparison) -> Figure | None:
         return None
     figure, axes = style.blank_panels(1, 1, (WIDTH_IN, WIDTH_IN))
     panel: Axes = axes[0, 0]
-    truth, true_landmarks = comparison.sequence.truth, comparison.sequence.true_landmarks
+    truth, true_landmarks = comparison.sequence.truth, true_landmarks_drawn(comparison)
     if truth is not None and len(truth):
         look: dict[str, Any] = {"color": style.TRUTH, "linewidth": 3.2, "alpha": 0.6, "solid_capstyle": "round"}
         panel.plot(*horizontal(truth), label="truth", zorder=1, **look)
@@ -72,6 +72,16 @@ def map_figure(comparison: Comparison) -> Figure | None:
     drawing_in = np.clip((WIDTH_IN - 0.8) * span[1] / span[0], 2.5, 8.0)
     figure.set_size_inches(WIDTH_IN, float(drawing_in) + 0.75 + 0.17 * legend_rows)
     return figure
+
+
+def true_landmarks_drawn(comparison: Comparison) -> LandmarkMap | None:
+    """The true landmarks in the world of the start pose: where they are surveyed in another, the first map tells."""
+    true = comparison.sequence.true_landmarks
+    maps = [run.landmarks for run in comparison.runs if run.landmarks is not None and len(run.landmarks)]
+    scored = scored_map(maps[0], comparison.sequence) if maps else None
+    if true is None or scored is None or scored.alignment is None:
+        return true
+    return scored.alignment.inverse().map(true)
 
 
 def paths_cut_off(comparison: Comparison) -> list[str]:
@@ -110,8 +120,9 @@ def map_view(comparison: Comparison) -> Floats | None:
 
     if not references and not estimates:
         return None
-    if sequence.true_landmarks and len(sequence.true_landmarks):
-        references.append(sequence.true_landmarks.positions[:, :2])
+    true = true_landmarks_drawn(comparison)
+    if true is not None and len(true):
+        references.append(true.positions[:, :2])
     maps = [run.landmarks.positions[:, :2] for run in comparison.runs if run.landmarks and len(run.landmarks)]
     anchor = box(np.vstack(references or estimates))
     largest = max(float(np.max(anchor[1] - anchor[0])), 1.0)
@@ -139,7 +150,7 @@ def ellipses(landmarks: LandmarkMap, edge: str, enlarged: float = 1.0) -> list[E
 
 def label_landmarks(panel: Axes, comparison: Comparison, view: Floats) -> None:
     """Write identities beside landmarks that are in view: the true ones, or those of the first run that has any."""
-    candidates = [comparison.sequence.true_landmarks, *(run.landmarks for run in comparison.runs)]
+    candidates = [true_landmarks_drawn(comparison), *(run.landmarks for run in comparison.runs)]
     landmarks = next((known for known in candidates if known is not None and len(known)), None)
     if landmarks is None:
         return
@@ -170,7 +181,7 @@ def growth_figure(comparison: Comparison) -> Figure | None:
     if view is None or not runs:
         return None
     view = view + np.array([[-1.0], [1.0]]) * LARGEST_ELLIPSE * float((view[1] - view[0]).max())
-    stamps_ns = np.unique([known.stamp_ns for _, run in runs for known in run.maps])
+    stamps_ns = grown_at(comparison)
     enlarged = enlargement(comparison)
     span = view[1] - view[0]
     height_in = np.clip(GROWTH_WIDTH_IN / len(stamps_ns) * span[1] / span[0], 1.2, 4.0)
@@ -179,7 +190,7 @@ def growth_figure(comparison: Comparison) -> Figure | None:
     for row, (index, run) in enumerate(runs):
         for column, stamp_ns in enumerate(stamps_ns.tolist()):
             panel: Axes = axes[row, column]
-            own, true = style.colour(index), comparison.sequence.true_landmarks
+            own, true = style.colour(index), true_landmarks_drawn(comparison)
             truth = comparison.sequence.truth
             _draw_until(panel, stamp_ns, truth, color=style.TRUTH, linewidth=2.6, alpha=0.6, label="truth")
             _draw_until(panel, stamp_ns, run.causal, color=own, linewidth=1.0, label="causal estimate")
@@ -210,6 +221,12 @@ def growth_figure(comparison: Comparison) -> Figure | None:
     return figure
 
 
+def grown_at(comparison: Comparison) -> Ints:
+    """Stamps at which the growing map is drawn, shape (n,)."""
+    kept = [known.stamp_ns for _, run in _runs_with_maps(comparison) for known in run.maps]
+    return np.intersect1d(kept, map_instants(comparison.instants_ns, comparison.sequence.start_ns))
+
+
 def enlargement(comparison: Comparison) -> int:
     """The factor by which ellipses are enlarged, so that they can be seen and do not cover each other."""
     view = map_view(comparison)
@@ -217,6 +234,7 @@ def enlargement(comparison: Comparison) -> int:
         np.sqrt(np.linalg.eigvalsh(cov).max())
         for _, run in _runs_with_maps(comparison)
         for known in run.maps
+        if known.stamp_ns in grown_at(comparison)
         for cov in known.landmarks.covariances[:, :2, :2]
         if np.isfinite(cov).all()
     ]

@@ -16,10 +16,10 @@ from sonar_graph.evaluation import (
     MOST_ROWS_NAMED,
     Comparison,
     RefusedRows,
-    anonymous_named,
     gathered,
     landmark_errors,
     normalised_squares,
+    scored_map,
 )
 from sonar_graph.settings import flattened
 from sonar_graph.states import FIRST_ANONYMOUS_ID, Outcome
@@ -74,6 +74,8 @@ def finding(comparison: Comparison) -> list[str]:
     if metric is None:
         if len(comparison.failed_runs) == len(runs):
             sentences.append("No estimator came to an end, so there is nothing to compare.")
+        elif mapped := _map_sentence(comparison):
+            sentences.append(mapped)
         elif comparison.sequence.truth is None:
             sentences.append(
                 "The log has no ground truth, so paths, maps and times can be compared, but no errors given."
@@ -92,15 +94,33 @@ def finding(comparison: Comparison) -> list[str]:
         scores = {what: score for what, key in CONSISTENCY_KEYS.items() if (score := comparison.score_of(name, key))}
         if scores:
             what = max(scores, key=lambda what: abs(math.log(max(scores[what].value, math.ulp(0.0)))))
-            said = ", ".join(filter(None, [what, scores[what].verdict]))
-            judged.append(f"{name} {scores[what].text()} ({said})")
+            said = [what, scores[what].verdict]
+            if scores[what].interval is not None:
+                low, high = map(scores[what].text, scores[what].interval)
+                said.append(f"{low} to {high} expected")
+            judged.append(f"{name} {scores[what].text()} ({', '.join(filter(None, said))})")
+    own = {run.estimator: comparison.score_of(run.estimator, "causal.own_map_m") for run in runs}
+    on_map = sorted(((name, score) for name, score in own.items() if score), key=lambda item: item[1].value)
+    if on_map:
+        listed = ", ".join(f"{name} {score.with_unit}" for name, score in on_map)
+        sentences.append(f"Position on its own map, as each knew it at that instant: {listed}.")
     if improved:
         sentences.append(f"Looking back from the end of the run (smoothed): {', '.join(improved)}.")
     if judged:
         sentences.append(
-            f"NEES, of position or yaw whichever is further from the 1 of a fitting uncertainty: {', '.join(judged)}."
+            "NEES, of position or yaw whichever is further from the 1 of a fitting uncertainty, with what 95 % of "
+            f"consistent runs with as many independent samples have: {', '.join(judged)}."
         )
     return sentences
+
+
+def _map_sentence(comparison: Comparison) -> str:
+    """Errors of maps against true landmarks where no path is known; empty without any."""
+    errors = {run.estimator: comparison.score_of(run.estimator, "landmarks.se2_m") for run in comparison.runs}
+    listed = [f"{name} {score.with_unit}" for name, score in errors.items() if score]
+    if not listed:
+        return ""
+    return f"No true path is known, but the landmarks are; maps after SE(2) alignment (RMS): {', '.join(listed)}."
 
 
 def no_detections(comparison: Comparison) -> str:
@@ -180,7 +200,10 @@ def doubt_of_identities(comparison: Comparison) -> list[str]:
     for run in comparison.runs:
         wrong: dict[int, float] = {}
         if run.landmarks is not None and true is not None:
-            errors = landmark_errors(anonymous_named(run.landmarks, true), true)
+            scored = scored_map(run.landmarks, comparison.sequence)
+            if scored is None:
+                continue
+            errors = landmark_errors(scored.landmarks, true)
             squares = normalised_squares(errors.horizontal_m, errors.horizontal_covs).tolist()
             wrong = {
                 id_: square / 2 for id_, square in zip(errors.ids.tolist(), squares, strict=True) if square > ABSURD
@@ -214,7 +237,8 @@ def nameless_landmarks(comparison: Comparison) -> list[str]:
         if true is None:
             which = f"identities from {FIRST_ANONYMOUS_ID} on are made up"
         else:
-            found = np.setdiff1d(anonymous_named(run.landmarks, true).ids, run.landmarks.ids).tolist()
+            scored = scored_map(run.landmarks, comparison.sequence)
+            found = [] if scored is None else np.setdiff1d(scored.landmarks.ids, run.landmarks.ids).tolist()
             which = f"scored by place, as {_listed(found)}" if found else "none is at the place of a true one"
         counted = "1 landmark" if count == 1 else f"{count} landmarks"
         said.append(f"{run.estimator} found {counted} without a name ({UNKNOWN}); {which}.")
