@@ -13,7 +13,15 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from sonar_graph.errors import EvaluationError, LogError, SonarGraphError
 
-_WRITTEN = ("report.html", "comparison.json", "sequence.npz", "result.mcap", "result.foxglove.json", "result.rviz")
+_WRITTEN = (
+    "report.html",
+    "comparison.json",
+    "ensembles.json",
+    "sequence.npz",
+    "result.mcap",
+    "result.foxglove.json",
+    "result.rviz",
+)
 _WRITTEN_FOR_A_RUN = ("trajectory.tum", "causal.tum", "landmarks.csv", "result.json", "series.npz")
 
 

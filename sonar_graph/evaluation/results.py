@@ -149,6 +149,27 @@ class ErrorSeries:
     """The same of ``nees_yaw``."""
 
 
+@dataclass(frozen=True)
+class Ensemble:
+    """Runs of one experiment by seed; lists of an estimator have one entry a run, None where it failed."""
+
+    condition: str
+    """The experiment in words, as a sentence goes on after "runs"."""
+    seeds: list[int]
+    seconds: list[float]
+    """Time since the start of the instants of ``errors_m`` and ``nees``."""
+    values: dict[str, dict[str, list[float | None]]]
+    """By estimator, then by key of `ensemble.KEPT`."""
+    errors_m: dict[str, list[list[float] | None]]
+    """Causal horizontal position error, not aligned, by estimator, run and instant."""
+    nees: dict[str, dict[str, list[list[float] | None]]]
+    """Causal NEES per degree of freedom, by estimator, "position" or "yaw", run and instant."""
+
+    def of(self, estimator: str, key: str) -> Floats:
+        """Values of one score by run, shape (runs,); infinite for a run without one."""
+        return np.array([np.inf if value is None else value for value in self.values[estimator][key]])
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison:
     """Several runs on one sequence, with scores: the content of comparison.json and of the report.
@@ -173,6 +194,8 @@ class Comparison:
     """Versions, machine, date, and the command that made it."""
     recognition: Recognition | None = None
     """The recognition of landmarks in sonar images; None where the log had detections or no images."""
+    ensembles: list[Ensemble] = field(default_factory=list)
+    """Many runs of the same experiment; empty where there is only this one."""
 
     def __repr__(self) -> str:
         runs = ", ".join(f"{run.estimator} {run.status}" for run in self.runs)

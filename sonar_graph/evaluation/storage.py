@@ -29,7 +29,7 @@ import numpy as np
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation.metrics import rmse
-from sonar_graph.evaluation.results import Comparison, ErrorSeries, Kind, MapSoFar, RunResult, Score, gathered
+from sonar_graph.evaluation.results import Comparison, Ensemble, ErrorSeries, Kind, MapSoFar, RunResult, Score, gathered
 from sonar_graph.files import read_json, replacing, write_json
 from sonar_graph.logs import Picture, write_landmarks_csv, write_result, write_tum
 from sonar_graph.logs.mcap import Attachment
@@ -45,6 +45,7 @@ KINDS: tuple[Kind, Kind] = ("causal", "smoothed")
 FORMAT = "sonar_graph comparison 1"
 INDEX, SEQUENCE, RUNS = "comparison.json", "sequence.npz", "runs"
 RESULT, SERIES, RESULT_LOG = "result.json", "series.npz", "result.mcap"
+ENSEMBLES = "ensembles.json"
 ESTIMATES = ("trajectory.tum", "causal.tum", "landmarks.csv")
 
 
@@ -88,6 +89,9 @@ def write_comparison(comparison: Comparison, folder: Path) -> None:
             entry["errors"] = {kind: _error_summary(series) for kind, series in errors.items()}
         entries[run.estimator] = entry
     write_recognition(comparison.recognition, folder)
+    (folder / ENSEMBLES).unlink(missing_ok=True)
+    if comparison.ensembles:
+        write_json(folder / ENSEMBLES, {"ensembles": [asdict(one) for one in comparison.ensembles]})
     sequence, instants = comparison.sequence, comparison.instants_ns
     index = {
         "format": FORMAT,
@@ -217,6 +221,7 @@ def _restore(index: dict[str, Any], folder: Path) -> Comparison:
             series = {kind: _unpack(f"errors.{kind}", ErrorSeries, arrays) for kind in KINDS}
             errors[name] = {kind: known for kind, known in series.items() if known is not None}
     arrays, entry = _read_arrays(folder / SEQUENCE), index["sequence"]
+    several = read_json(folder / ENSEMBLES) if (folder / ENSEMBLES).is_file() else {"ensembles": []}
     calibration = parse(Calibration, entry["calibration"], str(folder / INDEX))
     return Comparison(
         sequence=_restore_sequence(entry["name"], calibration, entry["notes"], arrays),
@@ -226,6 +231,7 @@ def _restore(index: dict[str, Any], folder: Path) -> Comparison:
         errors=errors,
         environment=index["environment"],
         recognition=read_recognition(folder),
+        ensembles=[Ensemble(**one) for one in several["ensembles"]],
     )
 
 

@@ -23,7 +23,6 @@ TRAJECTORY_LABELS = {
     "ate_yaw_m": "Position error, yaw and translation aligned (ATE, RMS)",
     "ate_se2_m": "Horizontal position error, SE(2) aligned (ATE, RMS)",
     "ate_se3_m": "Position error, SE(3) aligned (ATE, RMS)",
-    "own_map_m": "Horizontal position error on its own map as it was then (RMS)",
     "rpe_1s_m": "Drift over 1 s (RPE, RMS)",
     "rpe_10s_m": "Drift over 10 s (RPE, RMS)",
     "rpe_1s_rad": "Yaw drift over 1 s (RPE, RMS)",
@@ -34,7 +33,7 @@ TRAJECTORY_LABELS = {
     "nees_yaw": "Yaw NEES",
 }
 SCORES = {
-    "causal": TRAJECTORY_LABELS,
+    "causal": TRAJECTORY_LABELS | {"own_map_m": "Horizontal position error on its own map as it was then (RMS)"},
     "smoothed": TRAJECTORY_LABELS,
     "landmarks": {
         "raw_m": "Horizontal landmark error, not aligned (RMS)",

@@ -36,6 +36,8 @@ NO_LABEL = -2
 NONE = -1
 LEAST_FRAMES = 20
 """Labelled frames that every class needs."""
+MOST_CORRELATED = 0.99
+"""Upper limit of the correlation: some 200 frames for each detection."""
 ONE_STANDARD_ERROR_NATS = 0.5
 """Rise of the total loss at one sigma of a Gaussian likelihood."""
 
@@ -205,10 +207,25 @@ def estimate_confusion(
         threshold=threshold,
         range_sigma_m=float(sigmas[0]),
         azimuth_sigma_rad=float(sigmas[1]),
+        error_correlation=error_correlation(fits),
         provenance=provenance
         | {f"frames of {n}": str(c) for n, c in zip(names, counts.tolist(), strict=True)}
         | {f"tracks of {n}": str(c) for n, c in zip(names, tracks.tolist(), strict=True)},
     )
+
+
+def error_correlation(fits: LabelledFits) -> float:
+    """Correlation of the errors of a track's successive frames, at least 0: the mean of range's and azimuth's.
+
+    No mean is taken from the errors: one that all frames of a track share is what they have in common.
+    """
+    error, known = fits.range_azimuth_error, np.isfinite(fits.range_azimuth_error).all(axis=1)
+    products, squares = np.zeros(2), np.zeros(2)
+    for track in np.unique(fits.track[known]):
+        own = error[known & (fits.track == track)]
+        products += (own[1:] * own[:-1]).sum(axis=0)
+        squares += 0.5 * (own[1:] ** 2 + own[:-1] ** 2).sum(axis=0)
+    return float(np.clip(np.mean(products / np.maximum(squares, np.finfo(float).tiny)), 0.0, MOST_CORRELATED))
 
 
 def mean_scores(scores: Floats, label: Ints) -> Floats:

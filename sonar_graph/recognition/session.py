@@ -284,7 +284,8 @@ class RecognitionSession:
     def _draw(self, frame: SonarFrames, found: LandmarkDetections | None) -> None:
         """Draw one frame a period; of too many pictures every second is dropped and the period doubled."""
         pictures, stamp_ns = self.result.pictures, int(frame.stamps_ns[0])
-        if pictures and stamp_ns - pictures[-1].stamp_ns < self._picture_period_ns:
+        is_first_named = found is not None and bool(pictures) and not pictures[-1].landmark_ids
+        if pictures and stamp_ns - pictures[-1].stamp_ns < self._picture_period_ns and not is_first_named:
             return
         if self._fan is None or self._fan_of != (id(frame.ranges_m), id(frame.azimuths_rad)):
             self._fan = Fan.of(frame.ranges_m, frame.azimuths_rad)

@@ -21,6 +21,7 @@ from sonar_graph.evaluation import (
     UNJUDGED,
     Column,
     Comparison,
+    Ensemble,
     Table,
     confidences,
     format_value,
@@ -39,6 +40,7 @@ from sonar_graph.files import replacing
 from sonar_graph.logs import PICTURES
 from sonar_graph.recognition import SURE
 from sonar_graph.report import figures, sentences
+from sonar_graph.report.ensemble_section import ensemble_figure, ensemble_sentences, ensemble_table
 from sonar_graph.report.figure_style import Illustration, inline_svg
 from sonar_graph.report.landmark_table import PAPER, landmark_table, landmarks_left_out
 from sonar_graph.report.maps import enlargement, growth_figure, map_figure, paths_cut_off
@@ -127,6 +129,11 @@ def render_report(comparison: Comparison) -> str:
             f"{_counted(detections, 'landmark detection')}, {len(comparison.instants_ns)} instants, "
             f"{_counted(len(runs), 'estimator')}."
         ),
+        "ensemble": ensemble_sentences(comparison.ensembles),
+        "ensembles": [
+            (ensemble_table(one, f"runs-{place}"), ensemble_illustration(one, f"runs-{place}"))
+            for place, one in enumerate(comparison.ensembles, start=1)
+        ],
         "finding": sentences.finding(comparison),
         "doubts": [
             *sentences.doubt_of_identities(comparison),
@@ -166,6 +173,19 @@ def render_report(comparison: Comparison) -> str:
         "environment": comparison.environment,
     }
     return render(TEMPLATE, content)
+
+
+def ensemble_illustration(ensemble: Ensemble, name: str) -> Illustration:
+    """The figure of many runs."""
+    title = "Error and consistency over time"
+    caption = (
+        "Above: mean of the horizontal error of the causal positions, not aligned; the shaded band holds the middle "
+        f"80 % of {len(ensemble.seeds)} runs. Below: their average NEES; the grey band holds 95 % of consistent "
+        "estimators."
+    )
+    figure = ensemble_figure(ensemble)
+    svg = "" if figure is None else inline_svg(figure, name, f"{title}. {caption}")
+    return Illustration(name, title, caption, svg, "No run came to an end.")
 
 
 def _counted(count: int, noun: str) -> str:
@@ -317,8 +337,8 @@ FIGURES = {
     "own_map": (
         *("Where am I on my map?", figures.own_map_figure),
         "Horizontal error of the causal position after the map, as the estimator had it at that instant, is aligned "
-        "to the true landmarks. A smoother that moves its map when it learns moves itself with it: the path told before "
-        "is left behind, and only the other errors count that.",
+        "to the true landmarks. A smoother that moves its map when it learns moves itself with it: the path told "
+        "before is left behind, and only the other errors count that.",
         *("No run has a map of three true landmarks while the truth is known.", ("causal.own_map_m",)),
     ),
     "yaw": ("Yaw over time", figures.yaw_figure, "", "No run has a path to draw.", ("causal.yaw_rmse_rad",)),

@@ -7,6 +7,7 @@ from rich.text import Text
 
 from sonar_graph.evaluation import ABSENT, LABELS, Comparison, repeats_published, score_keys
 from sonar_graph.report import sentences
+from sonar_graph.report.ensemble_section import ensemble_sentences
 from sonar_graph.report.landmark_table import PAPER, landmark_table
 
 COLUMNS = {
@@ -68,7 +69,8 @@ def summary(comparison: Comparison) -> Group:
 
 def _lines_below(comparison: Comparison, metric: str | None) -> list[str]:
     """Failures, warnings, and the meaning of the columns."""
-    lines = [f"{run.estimator} failed: {run.reason}" for run in comparison.failed_runs]
+    lines = ensemble_sentences(comparison.ensembles)
+    lines += [f"{run.estimator} failed: {run.reason}" for run in comparison.failed_runs]
     lines += sentences.lost_runs(comparison)
     lines += sentences.refusal_lines(comparison)
     lines += sentences.withheld_lines(comparison)

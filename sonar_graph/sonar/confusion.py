@@ -14,6 +14,7 @@ The model that ships, ``default_confusion.json``, was measured on simulated basi
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -71,6 +72,8 @@ class Confusion(Section):
     """Standard deviation of the range in a frame that shows the whole landmark."""
     azimuth_sigma_rad: float = Field(gt=0)
     """The same of the azimuth."""
+    error_correlation: float = Field(0.0, ge=0, lt=1)
+    """Correlation of the errors of range and azimuth in successive frames of a track."""
     provenance: Mapping[str, str] = Field(default_factory=dict)
     """Source of the frames, counts by class, assumptions."""
 
@@ -116,6 +119,14 @@ class Confusion(Section):
         Sigmas grow with the inverse square of the share, as measured on simulated basins.
         """
         return np.diag(np.square(np.array([self.range_sigma_m, self.azimuth_sigma_rad]) / visible**2))
+
+    def report_interval(self) -> int:
+        """Number of frames of a track that tell as much of a place as one independent frame.
+
+        n frames whose errors have the correlation rho from one to the next (a first-order autoregression) tell as much
+        as ``1 + (n - 1) (1 - rho) / (1 + rho)`` independent ones: one more in every ``(1 + rho) / (1 - rho)`` frames.
+        """
+        return math.ceil((1 + self.error_correlation) / (1 - self.error_correlation) - 1e-9)
 
     def base(self) -> Floats:
         """Share of each feature for equally frequent classes, shape (ids + 1,)."""

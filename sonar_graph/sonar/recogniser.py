@@ -42,6 +42,9 @@ class RecogniserParams(Section):
     """Tracks that exist less probably are not reported."""
     least_frames: int = Field(3, ge=1)
     """Frames in which a track must have been seen before it is reported."""
+    independent: bool = True
+    """Report a track as often as its errors are independent, and when its most probable identity changes. False: in
+    every frame, as if errors of successive frames were independent."""
 
 
 class Fate(NamedTuple):
@@ -58,6 +61,7 @@ class Fate(NamedTuple):
 
 
 REPORTED = "reported"
+NOT_INDEPENDENT = "not reported: its error is still that of the track's last detection"
 REJECTED = {int(v): f"candidate rejected: {v.name.lower().replace('_', ' ')}" for v in CandidateVerdict}
 
 
@@ -112,6 +116,8 @@ class Recogniser:
         self._beliefs = Beliefs(self.confusion, self.params.identity)
         self._check = FrameCheck(calibration.sonar.image)
         self._start_T_sonar = gtsam.Pose3()
+        self._interval = self.confusion.report_interval() if self.params.independent else 1
+        self._reported: dict[int, tuple[int, int]] = {}
         self.fates: list[Fate] = []
         """Outcome of every candidate, track and fault in the last frame."""
         self.stamp_ns: int | None = None
@@ -182,19 +188,25 @@ class Recogniser:
             if verdict != CandidateVerdict.ACCEPTED
         ]
         reported = []
+        before = self._reported
+        self._reported = {track: before[track] for track in association.ids.tolist() if track in before}
         for row, sighting in enumerate(self.sightings):
             if sighting is None:
                 continue
-            outcome = REPORTED
+            outcome, track = REPORTED, int(association.ids[row])
+            seen, best = int(association.frames_seen[row]), int(np.argmax(beliefs[row]))
+            last_seen, last_best = before.get(track, (-self._interval, best))
             if sighting.fit is None:
                 outcome = "not reported: too little of it is in view"
             elif association.frames_seen[row] < params.least_frames:
                 outcome = f"not reported: seen in fewer than {params.least_frames} frames"
             elif association.existence[row] < params.least_existence:
                 outcome = f"not reported: exists with less than {params.least_existence:g}"
+            elif seen - last_seen < self._interval and best == last_best:
+                outcome = NOT_INDEPENDENT
             else:
                 reported.append((row, sighting))
-            track = int(association.ids[row])
+                self._reported[track] = seen, best
             self.fates.append(Fate(stamp_ns, track, sighting.range_m, sighting.azimuth_rad, outcome))
         self.fates += [
             Fate(stamp_ns, track, np.nan, np.nan, f"track ended: {reason}")

@@ -1,6 +1,7 @@
 from dataclasses import replace
 from typing import Any
 
+import gtsam
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -9,9 +10,12 @@ from sonar_graph.errors import EstimatorError, EvaluationError, UnknownEstimator
 from sonar_graph.evaluation.comparison import compare
 from sonar_graph.evaluation.results import RunResult
 from sonar_graph.evaluation.run import run_estimator
-from sonar_graph.evaluation.scores import detection_scores, resource_scores
+from sonar_graph.evaluation.scores import detection_scores, landmark_scores, resource_scores
 from sonar_graph.measurements import Measurements
-from sonar_graph.states import DetectionLog, Estimate, Outcome, Trajectory
+from sonar_graph.report import sentences
+from sonar_graph.report.landmark_table import landmark_table
+from sonar_graph.report.maps import true_landmarks_drawn
+from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, Trajectory
 
 from .conftest import Offset, straight_sequence
 
@@ -84,13 +88,13 @@ def test_ignored_detections_are_neither_used_nor_refused():
     assert "detections.nis" not in scores
 
 
-def test_only_independent_samples_get_a_band_and_spatial_runs_score_height_too(install):
+def test_bands_are_of_independent_samples_and_spatial_runs_score_height_too(install):
     comparison = compare(straight_sequence(planar=False), ["offset"])
     scores = comparison.scores["offset"]
     assert comparison.errors["offset"]["causal"].position_dof == 3
     assert scores["causal.nees_position"].value == pytest.approx(1 / 3)
-    assert scores["causal.nees_position"].interval is None
-    assert "correlated" in scores["causal.nees_position"].protocol
+    assert scores["causal.nees_position"].interval == (0.0, pytest.approx(chi2.ppf(0.975, 3) / 3))
+    assert "worth 1 independent samples" in scores["causal.nees_position"].protocol
     assert scores["detections.nis"].interval == pytest.approx(tuple(chi2.ppf([0.025, 0.975], 4) / 4))
 
 
@@ -180,3 +184,109 @@ def test_progress_names_the_estimator_and_the_environment_versions_machine_date_
     expected = {"sonar_graph", "python", "numpy", "gtsam", "machine", "date", "command"}
     assert expected <= set(comparison.environment)
     assert comparison.environment["numpy"] == np.__version__
+
+
+TURNED = gtsam.Pose3(gtsam.Rot3.Yaw(2.0), np.array([40.0, -7.0, 3.0]))
+
+
+def surveyed_elsewhere(offsets_m: dict[int, float] | None = None, *, has_truth: bool) -> Any:
+    """A comparison of an estimator whose map is right but for offsets, and true landmarks in a world of their own."""
+    ids = np.arange(1, 9)
+    places = np.random.default_rng(3).uniform(-9, 9, (8, 3)) * [1, 1, 0]
+
+    class Surveyor(Offset):
+        def landmarks(self) -> LandmarkMap:
+            moved = places + np.array([[(offsets_m or {}).get(i, 0.0), 0, 0] for i in ids.tolist()])
+            return LandmarkMap(ids, moved, np.tile(np.diag([1e-4, 4e-4, 1e-4]), (8, 1, 1)))
+
+    world = np.array([TURNED.transformFrom(place) for place in places])
+    sequence = replace(
+        straight_sequence(truth=has_truth), true_landmarks=LandmarkMap(ids, world, np.full((8, 3, 3), np.nan))
+    )
+    return Surveyor, sequence
+
+
+@pytest.mark.parametrize("has_truth", [False, True])
+def test_a_map_in_another_world_is_scored_after_alignment_where_no_path_tells_the_world(install, has_truth):
+    kind, sequence = surveyed_elsewhere(has_truth=has_truth)
+    install(surveyor=kind)
+    comparison = compare(sequence, ["surveyor"])
+    scores = comparison.scores["surveyor"]
+    assert scores["landmarks.se2_m"].value == pytest.approx(0.0, abs=1e-9)
+    assert ("landmarks.raw_m" in scores) == has_truth
+    assert bool(sentences.doubt_of_identities(comparison)) == has_truth, "with a true path the worlds are one"
+    assert scores["landmarks.nees"].value == pytest.approx(0.0, abs=1e-9) or scores["landmarks.nees"].value > 1e4
+    assert "aligned" in scores["landmarks.nees"].protocol
+    if not has_truth:
+        assert sentences.finding(comparison)[0].startswith("No true path is known, but the landmarks are")
+        drawn = true_landmarks_drawn(comparison)
+        np.testing.assert_allclose(drawn.positions, comparison.runs[0].landmarks.positions, atol=1e-9)
+        table = {row[0].text: [cell.text for cell in row[1:]] for row in landmark_table(comparison).rows}
+        assert "RMS, not aligned" not in table
+        assert table["ID 1, x"][1].endswith("(0.000)")
+
+
+def test_a_wrong_landmark_is_told_in_another_world_and_does_not_make_the_others_wrong(install):
+    kind, sequence = surveyed_elsewhere({5: 3.0}, has_truth=False)
+    install(surveyor=kind)
+    (line,) = sentences.doubt_of_identities(compare(sequence, ["surveyor"]))
+    assert "puts landmark 5 far outside its covariance" in line
+
+
+def test_the_normalised_error_of_an_aligned_map_has_the_freedom_that_alignment_leaves(install):
+    """Errors drawn from the covariance of the map, which turns with the alignment: 2 k - 3 degrees of freedom."""
+    found = []
+    for seed in range(200):
+        kind, sequence = surveyed_elsewhere(has_truth=False)
+        rng = np.random.default_rng(seed)
+
+        class Noisy(kind):  # type: ignore[misc, valid-type]
+            def landmarks(self, rng=rng, kind=kind) -> LandmarkMap:
+                exact = kind.landmarks(self)
+                noise = rng.standard_normal((8, 3)) * [0.01, 0.02, 0.0]
+                return replace(exact, positions=exact.positions + noise)
+
+        found.append(landmark_scores(Noisy(sequence.calibration).landmarks(), sequence)["landmarks.nees"].value)
+    assert np.mean(found) == pytest.approx(1.0, abs=0.2)
+
+
+class Moving(Offset):
+    """A map that wanders, and a pose that wanders with it; the pose is ``offset_m`` off on the map."""
+
+    def wander(self, stamp_ns: int) -> gtsam.Pose3:
+        seconds = (stamp_ns - 1_000_000_000) * 1e-9
+        return gtsam.Pose3(gtsam.Rot3.Yaw(0.02 * seconds), np.array([0.3 * seconds, 0.0, 0.0]))
+
+    def beside(self, stamp_ns: int, offset_m: float) -> Estimate:
+        right = super().beside(stamp_ns, offset_m)
+        return replace(right, pose=self.wander(stamp_ns).compose(right.pose))
+
+    def landmarks(self) -> LandmarkMap:
+        places = np.array([[1.0, 1, 0], [2, -1, 0], [4, 2, 0]])
+        wander = self.wander(self.estimates[-1].stamp_ns)
+        moved = np.array([wander.transformFrom(place) for place in places])
+        return LandmarkMap(np.array([7, 9, 11]), moved, np.tile(np.eye(3) * 0.01, (3, 1, 1)))
+
+
+class Few(Moving):
+    """Learns its third landmark after ten seconds."""
+
+    def landmarks(self) -> LandmarkMap:
+        known, late = super().landmarks(), self.estimates[-1].stamp_ns > 11_000_000_000
+        rows = slice(0, 3 if late else 2)
+        return LandmarkMap(known.ids[rows], known.positions[rows], known.covariances[rows])
+
+
+def test_the_error_on_its_own_map_does_not_count_how_the_map_moved_and_is_of_the_same_instants_for_all(install):
+    install(moving=Moving, few=Few)
+    places = np.array([[1.0, 1, 0], [2, -1, 0], [4, 2, 0]])
+    true = LandmarkMap(np.array([7, 9, 11]), places, np.full((3, 3, 3), np.nan))
+    sequence = replace(straight_sequence(), true_landmarks=true)
+    scores = compare(sequence, ["moving"], {"moving": {"offset_m": 0.25}}).scores["moving"]
+    assert scores["causal.own_map_m"].value == pytest.approx(0.25, abs=1e-9)
+    assert scores["causal.ate_se2_m"].value > 0.5, "the path counts it"
+    both = compare(sequence, ["moving", "few", "offset"])
+    counts = {name: both.scores[name]["causal.own_map_m"].protocol.split()[3] for name in ("moving", "few")}
+    assert counts["moving"] == counts["few"]
+    assert int(counts["few"]) < int(scores["causal.own_map_m"].protocol.split()[3])
+    assert "causal.own_map_m" not in both.scores["offset"], "its map names two true landmarks"

@@ -5,11 +5,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 from scipy.stats import binned_statistic, chi2
 
 from sonar_graph.calibration import Calibration, Mounting, SonarCalibration
 from sonar_graph.evaluation import consistency
+from sonar_graph.evaluation.results import Score
 from sonar_graph.measurements import LandmarkDetections
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, Trajectory
@@ -99,6 +101,45 @@ def test_average_over_runs_stays_inside_the_band_as_often_as_it_says():
     average = consistency.anees_over_runs(nees, 3)
     low, high = consistency.anees_interval(50, 3)
     assert np.mean((average > low) & (average < high)) == pytest.approx(0.95, abs=0.02)
+
+
+def drawn(rng: np.random.Generator, n: int, dof: int, tau: float) -> np.ndarray:
+    """Normalised errors that forget themselves over ``tau`` instants."""
+    kept = np.exp(-1 / tau)
+    steps = np.sqrt(1 - kept**2) * rng.standard_normal((n, dof))
+    steps[0] = rng.standard_normal(dof)
+    return lfilter([1], [1, -kept], steps, axis=0)
+
+
+def judged(unit: np.ndarray) -> str:
+    dof = unit.shape[1]
+    interval = consistency.time_average_interval(consistency.effective_samples(unit), dof)
+    return Score(float(np.mean(unit**2)), "1", "By hand.", interval, "inside").verdict
+
+
+@pytest.mark.parametrize("dof", [1, 2])
+@pytest.mark.parametrize("tau", [0.01, 10.0, 100.0, 1e4])
+def test_of_healthy_runs_hardly_one_is_called_inconsistent_however_slow_its_errors(tau, dof):
+    rng = np.random.default_rng(4)
+    verdicts = [judged(drawn(rng, 600, dof, tau)) for _ in range(200)]
+    assert np.mean([verdict == "over-confident" for verdict in verdicts]) <= 0.05
+    assert np.mean([verdict == "over-cautious" for verdict in verdicts]) <= 0.08
+    fast = tau <= 10  # then a run is worth enough samples to tell errors of twice the size
+    bad = [judged(2 * drawn(rng, 600, dof, tau)) for _ in range(50)]
+    assert np.mean([verdict == "over-confident" for verdict in bad]) >= (0.9 if fast else 0.0)
+
+
+def test_a_constant_error_is_one_sample_and_white_ones_are_all_and_unknown_none():
+    rng = np.random.default_rng(0)
+    white = rng.standard_normal((500, 3))
+    assert consistency.effective_samples(white) > 400
+    assert consistency.effective_samples(10 * white) == consistency.effective_samples(white), "size does not matter"
+    assert consistency.effective_samples(np.full((500, 1), 3.0)) == 1
+    half = white.copy()
+    half[::2] = np.nan
+    assert 200 < consistency.effective_samples(half) <= 250
+    assert consistency.effective_samples(np.full((5, 1), np.nan)) == 0
+    assert consistency.time_average_interval(0, 1) is None
 
 
 def test_nis_takes_used_detections_only():

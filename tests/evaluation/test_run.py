@@ -14,7 +14,7 @@ from sonar_graph.estimator import load_estimator, withheld_of
 from sonar_graph.evaluation import run as run_module
 from sonar_graph.evaluation.results import RunResult
 from sonar_graph.evaluation.run import PeakMemory, run_estimator
-from sonar_graph.evaluation.scored_instants import map_instants
+from sonar_graph.evaluation.scored_instants import MAPS_KEPT, kept_map_instants
 from sonar_graph.measurements import LandmarkDetections
 from sonar_graph.navigation import Odometry
 from sonar_graph.states import Estimate, LandmarkMap, Refusal, RefusedRow, Trajectory
@@ -253,7 +253,8 @@ def test_the_map_is_kept_on_the_way_as_it_was_known_then(ran):
     sequence = straight_sequence()
     result = ran(sequence, landmarks=lambda self: map_of([[0.0] * 3] * len(self.estimates)))
     instants = sequence.instants(2.0)
-    expected = map_instants(instants, sequence.start_ns)
+    expected = kept_map_instants(instants, sequence.start_ns)
+    assert len(expected) == MAPS_KEPT + 2, "those of the paper, and the last one once"
     assert [known.stamp_ns for known in result.maps] == expected.tolist()
     assert [len(known.landmarks) for known in result.maps] == (np.searchsorted(instants, expected) + 1).tolist()
     assert result.landmarks is result.maps[-1].landmarks

@@ -219,3 +219,23 @@ def test_a_class_that_was_seen_more_often_counts_no_more():
     assert other.sharpness == pytest.approx(one.sharpness, rel=0.01)
     assert other.threshold == pytest.approx(one.threshold, abs=0.002)
     np.testing.assert_allclose(other.matrix, one.matrix, atol=2e-3)
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.7])
+def test_the_correlation_of_errors_is_that_of_successive_frames_of_a_track(rho):
+    rng = np.random.default_rng(5)
+    tracks, frames = 40, 100
+    errors = rng.standard_normal((tracks, frames, 2))
+    for k in range(1, frames):
+        errors[:, k] = rho * errors[:, k - 1] + np.sqrt(1 - rho**2) * errors[:, k]
+    order = rng.permuted(np.tile(np.arange(tracks), frames))  # tracks are seen side by side
+    row = np.zeros(tracks, dtype=int)
+    error, track = [], []
+    for which in order.tolist():
+        error.append(errors[which, row[which]])
+        track.append(which)
+        row[which] += 1
+    fits = replace(_fits(2, 0.1), track=np.array(track), range_azimuth_error=np.array(error) * [1e-3, 4e-4])
+    assert confusion_fit.error_correlation(fits) == pytest.approx(rho, abs=0.03)
+    unknown = replace(fits, range_azimuth_error=np.full((len(order), 2), np.nan))
+    assert confusion_fit.error_correlation(unknown) == 0.0

@@ -81,3 +81,13 @@ def test_designs_that_ship_have_a_measured_model_and_others_an_assumed_one():
     assert "assumed" in other.provenance["origin"]
     np.testing.assert_allclose(other.array().sum(axis=1), 1)
     other.check_designs([RING])
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.3, 0.65, 0.9])
+def test_frames_between_reports_tell_together_what_one_independent_frame_tells(rho):
+    """The information of n frames about a constant, 1' C^-1 1, grows by one frame's in each interval."""
+    interval = model().model_copy(update={"error_correlation": rho}).report_interval()
+    lag = np.abs(np.subtract.outer(np.arange(400), np.arange(400)))
+    frames = np.linalg.inv(rho**lag).sum()
+    assert frames == pytest.approx(1 + 399 / ((1 + rho) / (1 - rho)))
+    assert interval - 1 < (1 + rho) / (1 - rho) <= interval + 1e-9

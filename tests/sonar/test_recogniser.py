@@ -2,6 +2,7 @@
 
 from collections import Counter
 from functools import cache
+from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -27,6 +28,8 @@ DECIBELS = Calibration(sonar=SonarCalibration(image=SonarImage(decibel_span=80.0
 FRAME_NS = 200_000_000
 DISC, SQUARE, TRIANGLE, CROSS = range(4)
 COVARIANCE = np.diag([1e-8] * 6)
+EVERY = RecogniserParams(independent=False)
+"""A detection in every frame, for laws about frames."""
 
 
 @cache
@@ -57,7 +60,7 @@ def pass_by(recogniser: Recogniser, design: int | None, frames: int = 9, step_m:
 
 @pytest.mark.parametrize("design", [DISC, SQUARE, TRIANGLE, CROSS])
 def test_a_landmark_passed_by_is_named_and_lies_where_geometry_says(design: int):
-    last = pass_by(Recogniser(DECIBELS), design)[-1]
+    last = pass_by(Recogniser(DECIBELS, params=EVERY), design)[-1]
     assert last.candidate_ids.tolist() == [[1, 2, 3, 4]]
     ids, probability = last.most_probable()
     assert ids.tolist() == [design + 1]
@@ -97,7 +100,7 @@ def test_a_track_is_reported_from_the_frame_that_is_enough_and_the_reason_is_sai
 
 
 def test_a_track_ends_with_a_row_and_the_next_has_another_number():
-    recogniser = Recogniser(DECIBELS)
+    recogniser = Recogniser(DECIBELS, params=EVERY)
     standing(recogniser, range(4), DISC)
     assert recogniser.track_ids.tolist() == [0]
     blank = standing(recogniser, range(4, 30), None)
@@ -112,7 +115,7 @@ def test_a_track_ends_with_a_row_and_the_next_has_another_number():
 def test_linear_samples_and_the_plane_of_the_image_give_nearly_the_same():
     """Patches are compared in that plane where no floor is known."""
     scale = Calibration(sonar=SonarCalibration(image=SonarImage(scale="linear", full_scale=1e8)))
-    recognisers = Recogniser(DECIBELS), Recogniser(scale), Recogniser(DECIBELS)
+    recognisers = Recogniser(DECIBELS, params=EVERY), Recogniser(scale), Recogniser(DECIBELS, params=EVERY)
     for k in range(4):
         image = np.maximum(picture(DISC, 1.7, 0.0, 0.4, k), 0.0)
         given = (image, VIEW), ((1e3 * 10 ** (image / 20)).astype(np.float32), VIEW), (image, None)
@@ -128,14 +131,14 @@ def test_other_designs_and_blocks_of_more_frames_are_refused():
     with pytest.raises(CalibrationError, match=r"\(1, 2\), the designs are \(1, 2, 3, 4\).*calibrate"):
         Recogniser(DECIBELS, params=model)
     assert Recogniser(DECIBELS, DEFAULT_DESIGNS[:2], model).ids.tolist() == [1, 2]
-    recogniser, both = Recogniser(DECIBELS), np.stack([picture(DISC, 1.7, 0.0, 0.0, k) for k in (1, 2)])
+    recogniser, both = Recogniser(DECIBELS, params=EVERY), np.stack([picture(DISC, 1.7, 0.0, 0.0, k) for k in (1, 2)])
     with pytest.raises(MeasurementError, match=r"a block of 2 frames; give blocks of one"):
         recogniser.process(SonarFrames(np.array([0, FRAME_NS]), both, RANGES_M, AZIMUTHS_RAD), None, VIEW)
     assert recogniser.stamp_ns is None
 
 
 def test_nothing_that_stands_out_disappears_without_a_row(monkeypatch: pytest.MonkeyPatch):
-    seen, select, recogniser = [], module.select_candidates, Recogniser(DECIBELS)
+    seen, select, recogniser = [], module.select_candidates, Recogniser(DECIBELS, params=EVERY)
     monkeypatch.setattr(module, "select_candidates", lambda *a, **k: seen.append(select(*a, **k)) or seen[-1])
     for k in range(4):
         recogniser.process(frame(k, picture(CROSS, 1.7, 0.0, 0.4, k)), aside(0.0, k), VIEW)
@@ -148,7 +151,7 @@ def test_nothing_that_stands_out_disappears_without_a_row(monkeypatch: pytest.Mo
 
 
 def test_a_bad_frame_has_a_row_and_no_sighting_and_the_motion_over_it_counts_once():
-    good, bad = Recogniser(DECIBELS), Recogniser(DECIBELS)
+    good, bad = Recogniser(DECIBELS, params=EVERY), Recogniser(DECIBELS, params=EVERY)
     for recogniser in (good, bad):
         pass_by(recogniser, SQUARE, 5)
     assert bad.process(frame(5, np.zeros((96, 512), np.float32)), aside(0.35), VIEW) is None
@@ -165,7 +168,7 @@ def test_a_bad_frame_has_a_row_and_no_sighting_and_the_motion_over_it_counts_onc
 
 def test_a_sonar_that_comes_to_rest_believes_for_500_frames_what_it_believed():
     """The same picture from the same place, an unseen bit brighter every other time: no copy of the frame before."""
-    recogniser, image = Recogniser(DECIBELS), picture(SQUARE, 1.7, -0.2, 0.4, 8)
+    recogniser, image = Recogniser(DECIBELS, params=EVERY), picture(SQUARE, 1.7, -0.2, 0.4, 8)
     before = pass_by(recogniser, SQUARE)[-1]
     for k in range(500):
         found = recogniser.process(frame(9 + k, image + np.float32(1e-3 * (k % 2))), aside(0.0), VIEW)
@@ -203,7 +206,7 @@ def test_turning_on_the_spot_is_no_news_and_moving_across_is():
 
 def test_what_is_across_turns_with_the_sonar(monkeypatch: pytest.MonkeyPatch):
     """After a quarter turn, motion along the old centre beam is motion to the side."""
-    recogniser, looks = Recogniser(DECIBELS), []
+    recogniser, looks = Recogniser(DECIBELS, params=EVERY), []
     step = recogniser._beliefs.step
     monkeypatch.setattr(recogniser._beliefs, "step", lambda *args: looks.append(args[2:]) or step(*args))
     for k, motion in enumerate([None, moved(turned=gtsam.Rot3.Rz(np.pi / 2)), moved(ahead_m=0.1)]):
@@ -216,7 +219,7 @@ def test_what_is_across_turns_with_the_sonar(monkeypatch: pytest.MonkeyPatch):
 
 def test_two_discs_at_once_are_not_both_the_disc():
     """Two discs in one image: one is the landmark, the other is believed to be none."""
-    recogniser = Recogniser(DECIBELS)
+    recogniser = Recogniser(DECIBELS, params=EVERY)
     for k in range(9):
         y_m = round(0.2 - 0.05 * k, 6)
         left, right = picture(DISC, 1.7, y_m + 0.2, 0.4, k), picture(DISC, 1.75, y_m - 0.2, 0.4, k)
@@ -238,3 +241,29 @@ def test_no_landmark_is_the_most_probable_identity_of_two_tracks(seed: int, trac
     assert len(set(after)) == len(after)
     if len(set(before)) == len(before):
         np.testing.assert_array_equal(found, beliefs)
+
+
+def test_a_track_is_reported_as_often_as_its_errors_are_independent_and_when_its_identity_changes():
+    model = confusion_for(DEFAULT_DESIGNS).model_copy(update={"error_correlation": 0.6})  # one frame in four
+    named = {}
+    for independent in (True, False):
+        recogniser = Recogniser(DECIBELS, params=RecogniserParams(confusion=model, independent=independent))
+        found = pass_by(recogniser, SQUARE, frames=15, step_m=0.02)
+        named[independent] = {k: int(one.most_probable()[0][0]) for k, one in enumerate(found) if one is not None}
+    assert len(named[False]) == 13, "from the third frame on"
+    reports = sorted(named[True])
+    assert reports[0] == min(named[False])
+    believed = [named[False][k] for k in sorted(named[False])]
+    for before, now in pairwise(reports):
+        assert now - before == 4 or named[True][before] != named[True][now]
+    assert len(reports) <= 2 + len(believed) // 4 + int(np.sum(np.diff(believed) != 0))
+    assert recogniser_said(model)[module.NOT_INDEPENDENT] == len(named[False]) - len(reports)
+
+
+def recogniser_said(model) -> Counter:
+    recogniser, said = Recogniser(DECIBELS, params=RecogniserParams(confusion=model)), Counter()
+    for k in range(15):
+        y = round((15 // 2 - k) * 0.02, 6)
+        recogniser.process(frame(k, picture(SQUARE, 1.7, y, 0.4, k)), aside(0.02, k), VIEW)
+        said.update(fate.outcome for fate in recogniser.fates if fate.track >= 0)
+    return said

@@ -1,0 +1,127 @@
+"""Section of a report on many runs of the same experiment: sentences, a table and a figure of means with bands.
+
+The mean of the final errors has its 95 % interval (Hall 1992), the ANEES at an instant the chi-square band of
+independent runs. Equations: docs/theory/metrics.md, docs/theory/batch_statistics.md.
+"""
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from sonar_graph.batch import Anees, anees, paired, summarise
+from sonar_graph.evaluation import Column, Ensemble, Table, absent, anees_interval, format_value, number, words
+from sonar_graph.measurements import Floats
+from sonar_graph.report import figure_style as style
+
+HEADLINE = "causal.ate_se2_m"
+SHOWN = {
+    HEADLINE: "Causal",
+    "smoothed.ate_se2_m": "Smoothed",
+    "causal.own_map_m": "On its own map",
+    "landmarks.se2_m": "Map",
+}
+DOF = {"position": 3, "yaw": 1}
+LOW, HIGH = 0.1, 0.9
+"""Quantiles of the runs between which the figure is shaded."""
+
+
+def mean_text(values: Floats) -> str:
+    """Mean of the runs with its 95 % interval, metres; the number of runs without a value where there are any."""
+    lost = int(np.isinf(values).sum())
+    if lost:
+        return f"{lost} of {len(values)} runs without"
+    low, high = paired(values, np.zeros_like(values)).interval
+    mean = format_value(float(values.mean()))
+    return mean if np.isnan(low) else f"{mean} ({format_value(max(low, 0.0))} to {format_value(high)})"
+
+
+def ensemble_sentences(ensembles: list[Ensemble]) -> list[str]:
+    """What the runs teach: mean errors under each condition, and how often a single run has them in another order."""
+    said = []
+    for place, ensemble in enumerate(ensembles):
+        values = {name: ensemble.of(name, HEADLINE) for name in ensemble.values}
+        order = sorted(values, key=lambda name: (np.isinf(values[name]).sum(), values[name].mean()))
+        listed = ", ".join(f"{name} {mean_text(values[name])}" for name in order)
+        opening = "" if place == 0 else "It is otherwise with other conditions: in "
+        said.append(
+            f"{opening}{len(ensemble.seeds)} runs {ensemble.condition}: mean causal position error after SE(2) "
+            f"alignment in metres, with its 95 % interval: {listed}."
+        )
+        if len(order) > 1:
+            first, second = order[:2]
+            wins = int((values[first] < values[second]).sum())
+            turned = len(ensemble.seeds) - wins
+            said[-1] += (
+                f" {first} has the smaller error in {wins} of them, {second} in {turned}"
+                f"{': one run could have said either' if turned > 0 else ''}."
+            )
+    return said
+
+
+def ensemble_table(ensemble: Ensemble, name: str) -> Table:
+    """Mean errors with intervals, and ANEES at the last instant with its band, by estimator."""
+    columns = [Column("estimator", "Estimator", is_number=False)]
+    columns += [Column(key, heading, "Mean of the runs (95 %), m") for key, heading in SHOWN.items()]
+    columns.append(Column("median", "Median (10 to 90 %), m", "Causal"))
+    columns += [Column(f"anees_{what}", what.capitalize(), "ANEES at the end") for what in DOF]
+    rows = []
+    for index, (estimator, scores) in enumerate(ensemble.values.items()):
+        cells = [words(estimator, run=index)]
+        for key in SHOWN:
+            values = ensemble.of(estimator, key)
+            known = any(value is not None for value in scores[key])
+            cells.append(number(float(values.mean()), mean_text(values)) if known else absent())
+        told = summarise(ensemble.of(estimator, HEADLINE))
+        spread = f"{format_value(told.median)} ({format_value(told.low)} to {format_value(told.high)})"
+        cells.append(number(told.median, spread))
+        for what, dof in DOF.items():
+            found = anees_at_end(ensemble, estimator, what, dof)
+            note = found.verdict and f"{found.verdict}; expected {found.band[0]:.2f} to {found.band[1]:.2f}"
+            cells.append(number(found.mean, format_value(found.mean), note=note))
+        rows.append(cells)
+    title = f"{len(ensemble.seeds)} runs {ensemble.condition}"
+    return Table(
+        name, title, "Detections are simulated; every run has other seeds of everything random.", columns, rows
+    )
+
+
+def anees_at_end(ensemble: Ensemble, estimator: str, what: str, dof: int) -> Anees:
+    """Average over the runs at the last instant that all have."""
+    last = np.array([np.inf if run is None else run[-1] for run in ensemble.nees[estimator][what]], dtype=float)
+    return anees(np.where(np.isnan(last), np.inf, last), dof)
+
+
+def ensemble_figure(ensemble: Ensemble) -> Figure | None:
+    """Position error over time, mean and middle 80 % of the runs, and ANEES over the runs with its 95 % band."""
+    figure, axes = style.blank_panels(2, 1, (7.4, 4.8), sharex=True)
+    errors, consistency = axes[:, 0]
+    seconds = np.array(ensemble.seconds)
+    least, most = np.inf, 0.0
+    for index, name in enumerate(ensemble.values):
+        runs = np.array([run for run in ensemble.errors_m[name] if run is not None], dtype=float)
+        if not len(runs):
+            continue
+        look = {"color": style.colour(index), "linestyle": style.line_style(index), "linewidth": 1.5}
+        low, high = np.quantile(runs, [LOW, HIGH], axis=0)
+        errors.fill_between(seconds, low, high, color=style.colour(index), alpha=0.2, linewidth=0)
+        errors.plot(seconds, runs.mean(axis=0), label=name, **look)
+        _draw_anees(consistency, seconds, ensemble, name, look)
+        least, most = min(least, float(runs[:, 1:].mean(axis=0).min())), max(most, float(high.max()))
+    if not most:
+        return None
+    band = anees_interval(len(ensemble.seeds), DOF["position"])
+    consistency.axhspan(*band, color=style.TRUTH, alpha=0.25, linewidth=0)
+    consistency.axhline(1.0, color=style.MUTED, linewidth=0.7)
+    for panel in (errors, consistency):
+        style.logarithmic(panel, "y")
+    errors.set_ylim(least / 2, most * 1.5)
+    style.name_axes(errors, "", "position error (m)")
+    style.name_axes(consistency, "time since start (s)", "ANEES of position / dof")
+    style.legend_above(figure, errors)
+    return figure
+
+
+def _draw_anees(panel: Axes, seconds: Floats, ensemble: Ensemble, name: str, look: dict[str, object]) -> None:
+    runs = [run for run in ensemble.nees[name]["position"] if run is not None]
+    if len(runs) == len(ensemble.seeds):
+        panel.plot(seconds, np.array(runs, dtype=float).mean(axis=0), **look)
