@@ -43,9 +43,9 @@ def own_map_errors(run: RunResult, sequence: Sequence, scored_ns: Ints) -> tuple
 
 
 def shared_map_instants(runs: Many[RunResult], sequence: Sequence, scored_ns: Ints) -> Ints:
-    """Stamps at which every run that ends with a map can be scored on it, shape (k,)."""
+    """Stamps at which every run that can be scored on its map at all can be, shape (k,)."""
     shared = scored_ns
-    for run in runs:
-        if run.landmarks is not None and len(run.landmarks):
-            shared = np.intersect1d(shared, own_map_errors(run, sequence, scored_ns)[0])
+    for stamps_ns in (own_map_errors(run, sequence, scored_ns)[0] for run in runs):
+        if len(stamps_ns):
+            shared = np.intersect1d(shared, stamps_ns)
     return shared

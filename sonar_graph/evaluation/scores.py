@@ -142,7 +142,7 @@ def own_map_scores(run: RunResult, sequence: Sequence, instants_ns: Ints) -> dic
     rule = (
         f"Causal estimate at {len(stamps_ns)} instants, moved by the alignment of the estimator's map as it was then "
         "to the true landmarks: rms of horizontal position error; of the instants at which maps are kept those at "
-        f"which every estimator with a map knows {LEAST_LANDMARKS} landmarks."
+        f"which every estimator that maps so many knows {LEAST_LANDMARKS} landmarks."
     )
     return {"causal.own_map_m": Score(rmse(errors_m), "m", rule)}
 

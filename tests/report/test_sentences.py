@@ -66,16 +66,16 @@ def test_a_failure_is_told_with_its_reason_as_it_is_and_as_wide_as_the_terminal(
 @pytest.mark.parametrize(
     ("value", "interval", "shown"),
     [
-        *((2.1, None, "2.10 ▲"), (1.9, None, "1.90"), (0.6, None, "0.600"), (0.4, None, "0.400 ▼")),
+        *((2.1, None, "2.10"), (0.4, None, "0.400"), (0.4, (0.9, 1.1), "0.400 ▼")),
         *((1.3, (0.9, 1.1), "1.30 ▲"), (2.1, (0.9, 2.2), "2.10")),
     ],
 )
-def test_a_nees_is_marked_by_the_rule_of_the_legend_or_its_interval(value, interval, shown):
+def test_a_nees_is_marked_outside_its_interval_and_never_without(value, interval, shown):
     text = printed(with_score(basin_comparison(60), "isam2", "causal.nees_yaw", nees(value, interval)))
     row = next(line for line in text.splitlines() if "isam2" in line)
     assert shown in row
     assert any(mark in shown for mark in "▲▼") or not re.search(f"{shown} [▲▼]", row)
-    assert "▲ above 2 over-confident, ▼ below 0.5 over-cautious" in text
+    assert "▲ over-confident, ▼ over-cautious" in text
 
 
 def test_what_is_lost_or_looks_wrong_in_a_log_is_told():

@@ -91,7 +91,7 @@ def standing(recogniser: Recogniser, frames: range, design: int | None = SQUARE,
     ],
 )
 def test_a_track_is_reported_from_the_frame_that_is_enough_and_the_reason_is_said(settings, y_m, reasons):
-    params = RecogniserParams(detection=DetectionParams(keep_at_edge=y_m > 0), **settings)
+    params = RecogniserParams(detection=DetectionParams(keep_at_edge=y_m > 0), independent=False, **settings)
     results = standing(Recogniser(DECIBELS, params=params), range(5), y_m=y_m)
     for (found, outcomes), reason in zip(results, reasons, strict=False):
         assert found is None
@@ -115,7 +115,7 @@ def test_a_track_ends_with_a_row_and_the_next_has_another_number():
 def test_linear_samples_and_the_plane_of_the_image_give_nearly_the_same():
     """Patches are compared in that plane where no floor is known."""
     scale = Calibration(sonar=SonarCalibration(image=SonarImage(scale="linear", full_scale=1e8)))
-    recognisers = Recogniser(DECIBELS, params=EVERY), Recogniser(scale), Recogniser(DECIBELS, params=EVERY)
+    recognisers = tuple(Recogniser(of, params=EVERY) for of in (DECIBELS, scale, DECIBELS))
     for k in range(4):
         image = np.maximum(picture(DISC, 1.7, 0.0, 0.4, k), 0.0)
         given = (image, VIEW), ((1e3 * 10 ** (image / 20)).astype(np.float32), VIEW), (image, None)
@@ -188,7 +188,7 @@ def test_more_frames_from_one_place_make_no_landmark_surer_and_the_papers_rule_c
 
 def _belief_after(steps: list[SonarStep], xy_m: list[tuple[float, float]]) -> float:
     """Belief in the square after frames along these steps, with the same picture of it in each."""
-    recogniser = Recogniser(DECIBELS, params=RecogniserParams(least_frames=1, least_existence=0.0))
+    recogniser = Recogniser(DECIBELS, params=RecogniserParams(least_frames=1, least_existence=0.0, independent=False))
     for k, (step, xy) in enumerate(zip([None, *steps], xy_m, strict=True)):
         found = recogniser.process(frame(k, picture(SQUARE, *xy, 0.4, 5)), step, VIEW)
     return float(found.id_probability[0, SQUARE])
