@@ -88,16 +88,21 @@ def run_member(options: BasinOptions, names: list[str]) -> _Member:
     instants_ns = sequence.instants(RATE_HZ)
     runs = [run_estimator(sequence, name, instants_ns=instants_ns) for name in names]
     comparison = judge(sequence, instants_ns, runs)
-    values, errors_m, nees = {}, {}, {}
+    values: dict[str, dict[str, float | None]] = {}
+    errors_m: dict[str, list[float] | None] = {}
+    nees: dict[str, dict[str, list[float] | None]] = {}
     for name in names:
         scores = {key: comparison.score_of(name, key) for key in KEPT}
         values[name] = {key: None if score is None else score.value for key, score in scores.items()}
         errors = comparison.errors.get(name, {}).get("causal")
-        errors_m[name] = None if errors is None else np.linalg.norm(errors.position_m[:, :2], axis=1).tolist()
-        nees[name] = {
-            "position": None if errors is None else (errors.nees_position / errors.position_dof).tolist(),
-            "yaw": None if errors is None else errors.nees_yaw.tolist(),
-        }
+        errors_m[name], nees[name] = None, {"position": None, "yaw": None}
+        if errors is not None:
+            place = np.searchsorted(instants_ns, errors.stamps_ns)
+            columns = np.full((3, len(instants_ns)), np.nan)
+            columns[0, place] = np.linalg.norm(errors.position_m[:, :2], axis=1)
+            columns[1:, place] = errors.nees_position / errors.position_dof, errors.nees_yaw
+            errors_m[name] = columns[0].tolist()
+            nees[name] = {"position": columns[1].tolist(), "yaw": columns[2].tolist()}
     seconds = ((instants_ns - sequence.start_ns) * 1e-9).tolist()
     return _Member(seconds, values, errors_m, nees)
 

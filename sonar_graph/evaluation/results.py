@@ -161,7 +161,7 @@ class Ensemble:
     values: dict[str, dict[str, list[float | None]]]
     """By estimator, then by key of `ensemble.KEPT`."""
     errors_m: dict[str, list[list[float] | None]]
-    """Causal horizontal position error, not aligned, by estimator, run and instant."""
+    """Causal horizontal position error, not aligned, by estimator, run and instant; NaN where not scored."""
     nees: dict[str, dict[str, list[list[float] | None]]]
     """Causal NEES per degree of freedom, by estimator, "position" or "yaw", run and instant."""
 

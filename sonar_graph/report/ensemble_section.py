@@ -5,7 +5,6 @@ independent runs. Equations: docs/theory/metrics.md, docs/theory/batch_statistic
 """
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sonar_graph.batch import Anees, anees, paired, summarise
@@ -42,7 +41,7 @@ def ensemble_sentences(ensembles: list[Ensemble]) -> list[str]:
         values = {name: ensemble.of(name, HEADLINE) for name in ensemble.values}
         order = sorted(values, key=lambda name: (np.isinf(values[name]).sum(), values[name].mean()))
         listed = ", ".join(f"{name} {mean_text(values[name])}" for name in order)
-        opening = "" if place == 0 else "It is otherwise with other conditions: in "
+        opening = "" if place == 0 else "Under other conditions it may be otherwise: "
         said.append(
             f"{opening}{len(ensemble.seeds)} runs {ensemble.condition}: mean causal position error after SE(2) "
             f"alignment in metres, with its 95 % interval: {listed}."
@@ -86,26 +85,29 @@ def ensemble_table(ensemble: Ensemble, name: str) -> Table:
 
 
 def anees_at_end(ensemble: Ensemble, estimator: str, what: str, dof: int) -> Anees:
-    """Average over the runs at the last instant that all have."""
-    last = np.array([np.inf if run is None else run[-1] for run in ensemble.nees[estimator][what]], dtype=float)
-    return anees(np.where(np.isnan(last), np.inf, last), dof)
+    """Average over the runs, each at its last scored instant."""
+    runs = [np.array(run or [], dtype=float) for run in ensemble.nees[estimator][what]]
+    return anees(np.array([known[-1] if len(known := run[~np.isnan(run)]) else np.inf for run in runs]), dof)
 
 
 def ensemble_figure(ensemble: Ensemble) -> Figure | None:
     """Position error over time, mean and middle 80 % of the runs, and ANEES over the runs with its 95 % band."""
     figure, axes = style.blank_panels(2, 1, (7.4, 4.8), sharex=True)
     errors, consistency = axes[:, 0]
-    seconds = np.array(ensemble.seconds)
     least, most = np.inf, 0.0
     for index, name in enumerate(ensemble.values):
         runs = np.array([run for run in ensemble.errors_m[name] if run is not None], dtype=float)
         if not len(runs):
             continue
         look = {"color": style.colour(index), "linestyle": style.line_style(index), "linewidth": 1.5}
+        scored = np.flatnonzero(~np.isnan(runs).any(axis=0))
+        runs, seconds = runs[:, scored], np.array(ensemble.seconds)[scored]
         low, high = np.quantile(runs, [LOW, HIGH], axis=0)
         errors.fill_between(seconds, low, high, color=style.colour(index), alpha=0.2, linewidth=0)
         errors.plot(seconds, runs.mean(axis=0), label=name, **look)
-        _draw_anees(consistency, seconds, ensemble, name, look)
+        nees = [run for run in ensemble.nees[name]["position"] if run is not None]
+        if len(nees) == len(ensemble.seeds):
+            consistency.plot(seconds, np.array(nees, dtype=float)[:, scored].mean(axis=0), **look)
         least, most = min(least, float(runs[:, 1:].mean(axis=0).min())), max(most, float(high.max()))
     if not most:
         return None
@@ -119,9 +121,3 @@ def ensemble_figure(ensemble: Ensemble) -> Figure | None:
     style.name_axes(consistency, "time since start (s)", "ANEES of position / dof")
     style.legend_above(figure, errors)
     return figure
-
-
-def _draw_anees(panel: Axes, seconds: Floats, ensemble: Ensemble, name: str, look: dict[str, object]) -> None:
-    runs = [run for run in ensemble.nees[name]["position"] if run is not None]
-    if len(runs) == len(ensemble.seeds):
-        panel.plot(seconds, np.array(runs, dtype=float).mean(axis=0), **look)
