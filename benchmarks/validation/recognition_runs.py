@@ -77,7 +77,7 @@ def run_basin(options: BasinOptions, rules: Sequence[str]) -> Run:
     sessions = {
         rule: RecognitionSession(
             sequence,
-            params=RecogniserParams(identity=IdentityParams.model_validate({"rule": rule})),
+            params=RecogniserParams(identity=IdentityParams.model_validate({"rule": rule}), independent=False),
             pictures=False,
         )
         for rule in rules

@@ -282,11 +282,12 @@ class RecognitionSession:
         self.result.outcomes[reason] += 1
 
     def _draw(self, frame: SonarFrames, found: LandmarkDetections | None) -> None:
-        """Draw one frame a period; of too many pictures every second is dropped and the period doubled."""
+        """Draw one frame a period, rather one with detections; of too many drop every second and double the period."""
         pictures, stamp_ns = self.result.pictures, int(frame.stamps_ns[0])
-        is_first_named = found is not None and bool(pictures) and not pictures[-1].landmark_ids
-        if pictures and stamp_ns - pictures[-1].stamp_ns < self._picture_period_ns and not is_first_named:
-            return
+        if pictures and stamp_ns - pictures[-1].stamp_ns < self._picture_period_ns:
+            if found is None or pictures[-1].landmark_ids:
+                return
+            pictures.pop()
         if self._fan is None or self._fan_of != (id(frame.ranges_m), id(frame.azimuths_rad)):
             self._fan = Fan.of(frame.ranges_m, frame.azimuths_rad)
             self._fan_of = (id(frame.ranges_m), id(frame.azimuths_rad))

@@ -95,8 +95,8 @@ def finding(comparison: Comparison) -> list[str]:
         if scores:
             what = max(scores, key=lambda what: abs(math.log(max(scores[what].value, math.ulp(0.0)))))
             said = [what, scores[what].verdict]
-            if scores[what].interval is not None:
-                low, high = map(scores[what].text, scores[what].interval)
+            if (interval := scores[what].interval) is not None:
+                low, high = map(scores[what].text, interval)
                 said.append(f"{low} to {high} expected")
             judged.append(f"{name} {scores[what].text()} ({', '.join(filter(None, said))})")
     own = {run.estimator: comparison.score_of(run.estimator, "causal.own_map_m") for run in runs}
