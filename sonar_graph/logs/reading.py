@@ -27,6 +27,7 @@ from sonar_graph.logs.adapters import (
     TruthAdapter,
     changes_text,
     detection_warnings,
+    plain_lines,
     shipped_like,
 )
 from sonar_graph.logs.cdr import short_name
@@ -47,6 +48,7 @@ from sonar_graph.logs.roles import ROLES, SEQUENCE_ROLES, SONAR, Choice, choose_
 from sonar_graph.logs.vehicle_setup import (
     PartialCalibration,
     gathered,
+    measured_start,
     mounted_by,
     mounting_of,
     read_calibration,
@@ -203,7 +205,7 @@ class Assembly:
         if "truth" in choices and choices["truth"].topic is None:
             self._notes["log.truth"] = choices["truth"].reason
         self._notes |= recording.notes()
-        self._is_mounting_known = True
+        self._is_mounting_known = self._is_start_stated = True
         self.calibration = calibration if isinstance(calibration, Calibration) else self._gathered(calibration)
         if isinstance(calibration, Calibration):
             self._notes["log.calibration"] = "given by the caller"
@@ -211,6 +213,10 @@ class Assembly:
     def _gathered(self, given: PartialCalibration | None) -> Calibration:
         """The calibration of user, record, ``/tf_static`` and defaults, with its sources in the notes."""
         recorded = read_calibration(self._recording)
+        self._is_start_stated = "start" in {
+            *(given.values if given else ()),
+            *(recorded.model_fields_set if recorded else ()),
+        }
         stated = mounted_by(recorded.model_dump(exclude_unset=True)) if recorded else set()
         stated |= mounted_by(given.values) if given else set()
         frames = {
@@ -307,6 +313,12 @@ class Assembly:
             for role, table in self._tables.items()
             for text in stamp_faults(table.stamps_ns, table.topic.log_times_ns)
         ]
+        if not self._is_start_stated:
+            start_ns = int(max(blocks["imu"].stamps_ns[0], blocks["dvl"].stamps_ns[0]))
+            if (start := measured_start(self.calibration, start_ns, blocks["dvl"], blocks)) is not None:
+                self.calibration = self.calibration.model_copy(update={"start": start})
+                said = ", ".join(plain_lines(start.model_dump()))
+                self._notes["log.start"] = f"not stated, so by the first headings and fixes: {said}"
         findings = {
             "log.dropped": self.left_out(),
             "log.stamps": stamps,

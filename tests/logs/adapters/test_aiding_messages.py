@@ -226,3 +226,44 @@ def test_a_true_orientation_that_never_changes_is_doubted_and_may_be_left_out(fo
 def test_a_table_without_a_source_of_its_numbers_is_refused(foreign: Any, toml: str, said: str) -> None:
     with pytest.raises(LogError, match=said):
         foreign.read(toml=toml)
+
+
+def aided(*, wrong: int = -1) -> list[Entry]:
+    """Heading of 2 rad and five fixes 3 m east of each other's first, of a vehicle at 1 m/s; one row may be wrong."""
+    turned = {"quaternion": {"z": np.sin(1.0), "w": np.cos(1.0)}}
+    places = [(3.0, 4.0, 0.5)] * 5
+    rows = [turned] * 5
+    if wrong >= 0:
+        rows[wrong], places[wrong] = {"quaternion": {"z": 1.0, "w": 0.0}}, (900.0, 900.0, 0.0)
+    headings = rows_of("/gps/heading", TURNED, rows)
+    return [headings, points(*places), dvl(velocity=vector(1, 0, 0)), imu()]
+
+
+ANTENNA = "[positions]\nantenna_m = [1.0, 0.0, 0.0]\n"
+
+
+@pytest.mark.parametrize("wrong", [-1, 0, 4])
+def test_a_start_that_is_not_stated_is_that_of_the_first_headings_and_fixes(
+    foreign: Any, tmp_path: Any, wrong: int
+) -> None:
+    """With three times their sigma, of fixes with what the vehicle moves meanwhile; one wrong row does not count."""
+    calibration = tmp_path / "vehicle.toml"
+    calibration.write_text(ANTENNA)
+    sequence = foreign.read(*aided(wrong=wrong), calibration=calibration)
+    start = sequence.calibration.start
+    assert start.rpy_rad == pytest.approx((0, 0, 2.0), abs=1e-4)
+    assert start.position_m == pytest.approx((3 - np.cos(2), 4 - np.sin(2), 0.5), abs=1e-4)
+    assert start.rpy_sigma_rad == pytest.approx((1e-3, 1e-3, 3 * np.hypot(0.02, 0.05)), abs=1e-4)
+    assert start.position_sigma_m[0] == pytest.approx(3 * np.hypot(2.5, 0.4), abs=1e-4)
+    assert "not stated, so by the first headings and fixes: position_m = [" in sequence.notes["log.start"]
+    calibration.write_text(f"{ANTENNA}[start]\nrpy_rad = [0, 0, 1]")
+    stated = foreign.read(*aided(), calibration=calibration)
+    assert stated.calibration.start.rpy_rad == (0, 0, 1)
+    assert "log.start" not in stated.notes
+
+
+def test_a_start_without_headings_or_fixes_stays_that_of_the_calibration(foreign: Any) -> None:
+    assert foreign.read(dvl(), imu()).calibration.start == foreign.read().calibration.start
+    only_fixes = foreign.read(*aided()[1:]).calibration.start
+    assert only_fixes.rpy_rad == (0, 0, 0)
+    assert only_fixes.position_m == (3, 4, 0.5)
