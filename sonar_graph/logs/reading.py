@@ -213,10 +213,7 @@ class Assembly:
     def _gathered(self, given: PartialCalibration | None) -> Calibration:
         """The calibration of user, record, ``/tf_static`` and defaults, with its sources in the notes."""
         recorded = read_calibration(self._recording)
-        self._is_start_stated = "start" in {
-            *(given.values if given else ()),
-            *(recorded.model_fields_set if recorded else ()),
-        }
+        self._is_start_stated = recorded is not None or bool(given and "start" in given.values)
         stated = mounted_by(recorded.model_dump(exclude_unset=True)) if recorded else set()
         stated |= mounted_by(given.values) if given else set()
         frames = {
