@@ -22,7 +22,7 @@ import math
 
 import numpy as np
 
-from baselines.filter import Motion, SonarModel, correction, far_view, is_inside, polar_covariance
+from baselines.filter import GATED, Gate, Motion, SonarModel, admit, correction, far_view, polar_covariance
 from sonar_graph.measurements import Floats
 from sonar_graph.numerics import (
     I3,
@@ -112,11 +112,11 @@ def write_row(H_v: Vec6, P: Floats, U_r: Floats) -> None:
 @compiled
 def observe(
     x: Floats, P: Floats, at: int, dR_: Floats, dp_: Floats, C: Floats,
-    body_R_sonar: Floats, body_p_sonar: Floats, z: Floats, R_z: Floats, gate: float, e: Floats, S: Floats,
-) -> bool:  # fmt: skip
-    """Update by range and azimuth of the landmark at ``x[at : at + 3]``, where its innovation is inside the gate.
+    body_R_sonar: Floats, body_p_sonar: Floats, z: Floats, R_z: Floats, gate: Gate, e: Floats, S: Floats,
+) -> int:  # fmt: skip
+    """Update by range and azimuth of the landmark at ``x[at : at + 3]``, where the gate admits it.
 
-    Returns whether it was used, and writes e of (7) and its covariance ``S = H P H^T + H_b C H_b^T + R_z``.
+    Returns the outcome's number, and writes e of (7) and its covariance ``S = H P H^T + H_b C H_b^T + R_z``.
     """
     dR, dp, angles = mat(dR_), vec(dp_), vec(x[3:])
     R, W, B = rotation_from_euler(angles), body_rates_from_euler(angles), mat(body_R_sonar)
@@ -138,10 +138,10 @@ def observe(
             U_v = Vec6(U_X, Vec3(U[b, 3], U[b, 4], U[b, 5]))
             S[a, b] = R_z[a, b] + (H_v[a] @ U_v + H_b[a] @ (mat6(C) @ H_b[b]))
     S[1, 0] = S[0, 1]
-    is_used = is_inside(e, S, gate)
-    if is_used:
-        correct(x, P, U, S, e)
-    return is_used
+    outcome, widened = admit(e, S, R_z, gate)
+    if outcome != GATED:
+        correct(x, P, U, S + widened, e)
+    return outcome
 
 
 def location(
@@ -164,7 +164,7 @@ def location(
 
 def observe_far(
     x: Floats, P: Floats, at: int, motion: Motion, sonar: SonarModel, z: Floats, R_z: Floats
-) -> tuple[bool, Floats, Floats] | None:
+) -> tuple[int, Floats, Floats] | None:
     """Update as `observe` by a landmark far from where it is predicted, by the point seen (`far_view`); else None."""
     seen, G_v, G_b, G_z = location(x, motion, sonar, z, 0.0)
     H = np.zeros((LANDMARK, len(x)))
@@ -173,11 +173,10 @@ def observe_far(
     view = far_view(missed, U @ H.T + G_b @ motion.C @ G_b.T, G_z, sonar, z, R_z)
     if view is None:
         return None
-    cov, e, S = view
-    is_used = is_inside(e, S, sonar.gate)
-    if is_used:
+    outcome, cov, e, S = view
+    if outcome != GATED:
         correct(x, P, U, cov, missed)
-    return is_used, e, S
+    return outcome, e, S
 
 
 # -------------------------------------------------------------------------------- update

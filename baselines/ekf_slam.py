@@ -15,13 +15,12 @@ from baselines.filter import (
     DEPTH,
     EPOCH,
     FRAME,
-    GATED,
     GRAVITY,
     NO_BIAS,
-    USED,
     Events,
     FilterParams,
     FilterShell,
+    Gate,
     Motion,
     add_force,
     remove_rate,
@@ -41,7 +40,7 @@ SINGULAR_COSINE = 1e-3
 @compiled
 def advance(
     x: Floats, P: Floats, i_R_j: Floats, impulse: Floats, earth: Floats, port: Floats, depth_variance: float,
-    body_R_sonar: Floats, body_p_sonar: Floats, gate: float, events: Events, k: int,
+    body_R_sonar: Floats, body_p_sonar: Floats, gate: Gate, events: Events, k: int,
 ) -> int:  # fmt: skip
     """Use events from k on, up to a gap, a landmark that is new or may be far, or an event of another kind."""
     dR, dp, C, D, force = events.dR, events.dp, events.C, events.D, events.impulse
@@ -66,11 +65,10 @@ def advance(
                 if events.outcome[row] == ACCEPTED:
                     if events.landmark[row] < 0:
                         return k
-                    is_used = observe(
+                    events.outcome[row] = observe(
                         x, P, POSE + LANDMARK * events.landmark[row], dR[k], dp[k], C[k], body_R_sonar, body_p_sonar,
                         events.z[row], events.R_z[row], gate, events.e[row], events.S[row],
                     )  # fmt: skip
-                    events.outcome[row] = USED if is_used else GATED
                 row += 1
         else:
             break
@@ -92,7 +90,7 @@ class EkfSlam(FilterShell):
     Localization Using Landmarks". Choices that the paper leaves open are in docs/theory/ekf_slam.md; those to know:
 
     - There is no gyro bias in the state (4), and its drift is not in the covariance: with a biased gyro the filter is
-      overconfident in its heading and in time gates true detections.
+      overconfident in its heading, and a gate, which is not there by default, refuses true detections in time.
     - A gap of the Doppler log is bridged as by every estimator; there Q holds the gyro bias, which tilts gravity.
       Measurements in a gap are related to the state before it, with growing variance.
     - A new landmark's elevation comes from a floor of known height, else it is 0 with sigma aperture / sqrt(12).
@@ -149,7 +147,7 @@ class EkfSlam(FilterShell):
 
     def observe(
         self, motion: Motion, slot: int, z: Floats, R_z: Floats, *, may_be_far: bool
-    ) -> tuple[bool, Floats, Floats]:
+    ) -> tuple[int, Floats, Floats]:
         """Update by range and azimuth of a known landmark, (6) and (7)."""
         at, sonar = POSE + LANDMARK * slot, self.sonar
         if may_be_far and (told := ekf_equations.observe_far(self._x, self._P, at, motion, sonar, z, R_z)) is not None:

@@ -29,8 +29,8 @@ from sonar_graph.measurements import Depth, Floats, Ints, LandmarkDetections, Me
 from sonar_graph.motion import Motions, MotionSource, require_source
 from sonar_graph.navigation.alignment import earth_rate_in_world, tilt_sigma, up_direction
 from sonar_graph.numerics import I3, LOWER_LEFT, ZERO, compiled, cross, exp_and_mean, mat, store, vec
-from sonar_graph.slam.landmarks import ACCEPTED, gate_threshold, identify
-from sonar_graph.slam.models import elevation_on_floor
+from sonar_graph.slam.landmarks import ACCEPTED, MINIMUM_PROBABILITY, gate_threshold, identify
+from sonar_graph.slam.models import KernelParams, RobustKernel, elevation_on_floor
 from sonar_graph.states import (
     OUTCOME_NUMBERS,
     CausalEstimates,
@@ -47,10 +47,12 @@ from sonar_graph.states import (
 class FilterParams(Section):
     """Settings of both filters; the paper gives none of them."""
 
-    gate_probability: float = Field(0.999, gt=0, le=1)
-    """Probability with which a right detection passes the gate (chi-square); 1: no gate."""
-    minimum_id_probability: float = Field(0.5, ge=0, le=1)
-    """Least posterior of the most probable identity with which a detection is used."""
+    gate_probability: float = Field(1.0, gt=0, le=1)
+    """Probability with which a right detection passes the gate (chi-square); 1: no gate, as published."""
+    kernel: KernelParams = RobustKernel()
+    """Shape of the noise of range and of azimuth, by which outliers pull less; the smoother's default too."""
+    minimum_id_probability: float = Field(MINIMUM_PROBABILITY, ge=0, le=1)
+    """Least posterior of the most probable identity with which a detection is used; the smoother's default too."""
     gravity_interval_s: float = Field(1.0, gt=0)
     """Time over which the specific force is averaged for one correction of roll and pitch."""
 
@@ -99,7 +101,10 @@ def up_at_end(i_R_j: Floats, impulse: Floats, interval: Floats) -> Floats:
 
 EPOCH, PLANE, GRAVITY, DEPTH, FRAME, END = range(6)
 """Kinds of events; at equal stamps the lower comes first, but plane and gravity right after their epoch."""
-USED, GATED, NEW = (OUTCOME_NUMBERS[outcome] for outcome in (Outcome.USED, Outcome.GATED, Outcome.NEW))
+USED, GATED, NEW, LET_IN = (OUTCOME_NUMBERS[o] for o in (Outcome.USED, Outcome.GATED, Outcome.NEW, Outcome.LET_IN))
+OUTLYING, JUDGED_TOGETHER = -2.0 * math.log(0.001), 10
+"""Squared Mahalanobis distance that one right detection in a thousand exceeds, and number of detections of which most
+tell: with a tenth of outliers six of ten are so once in 7,000 times, ``P(Bin(10, 0.1) > 5) = 1.5e-4``."""
 NOT_STARTED, LONG_AGO = int(np.iinfo(np.int64).max), int(np.iinfo(np.int64).min)
 
 
@@ -227,13 +232,61 @@ def correction(P: Floats, U: Floats, S: Floats, e: Floats) -> Floats:
     return Ke
 
 
+class Gate(NamedTuple):
+    """Doubt about detections: a gate that refuses, and a kernel that widens the noise of outliers."""
+
+    threshold: float
+    """Squared Mahalanobis distance beyond which an innovation is refused."""
+    width: float
+    """Of the kernel, in standard deviations; infinite: none."""
+    is_huber: bool
+    outlying: NDArray[np.bool_]
+    """Which of the last detections were outliers, as a ring."""
+    judged: Ints
+    """Number of detections so far, shape (1,)."""
+
+    @classmethod
+    def of(cls, params: FilterParams) -> "Gate":
+        """The gate and kernel of a filter's settings, with nothing judged yet."""
+        kernel, threshold = params.kernel, gate_threshold(params.gate_probability, 2)
+        width, is_huber = (
+            (kernel.width, kernel.shape == "huber") if isinstance(kernel, RobustKernel) else (math.inf, False)
+        )
+        return cls(threshold, width, is_huber, np.zeros(JUDGED_TOGETHER, np.bool_), np.zeros(1, np.int64))
+
+
+@compiled
+def admit(e: Floats, S: Floats, R_z: Floats, gate: Gate) -> tuple[int, Floats]:
+    """Judge an innovation of range and azimuth: `USED`, `GATED` or `LET_IN`, and what the kernel adds to R_z (2, 2).
+
+    The kernel's weights w_i at ``e_i / sqrt(S_ii)`` make ``R_ij / sqrt(w_i w_j)`` of the noise. While most of the last
+    detections are outliers, the filter is wrong, not they: no gate, no kernel. docs/theory/fair_comparison.md.
+    """
+    squared = S[1, 1] * e[0] ** 2 - 2.0 * S[0, 1] * e[0] * e[1] + S[0, 0] * e[1] ** 2
+    squared /= S[0, 0] * S[1, 1] - S[0, 1] ** 2
+    widened, is_inside = np.zeros((2, 2)), squared <= gate.threshold
+    gate.outlying[gate.judged[0] % len(gate.outlying)] = not squared <= OUTLYING
+    gate.judged[0] += 1
+    if 2 * gate.outlying.sum() > len(gate.outlying):
+        return USED if is_inside else LET_IN, widened
+    if not is_inside:
+        return GATED, widened
+    spread = np.empty(2)
+    for i in range(2):
+        share = abs(e[i]) / (math.sqrt(S[i, i]) * gate.width)
+        spread[i] = math.sqrt(max(1.0, share) if gate.is_huber else 1.0 + share**2)
+    for i in range(2):
+        for j in range(2):
+            widened[i, j] = (spread[i] * spread[j] - 1.0) * R_z[i, j]
+    return USED, widened
+
+
 class SonarModel(NamedTuple):
     """Sonar mounting and noise, gate, and floor."""
 
     body_R_sonar: Floats
     body_p_sonar: Floats
-    gate: float
-    """Squared Mahalanobis distance beyond which an innovation is refused."""
+    gate: Gate
     aperture_rad: float
     R_z: Floats
     """Covariance of range and azimuth where the log has none, shape (2, 2)."""
@@ -243,13 +296,13 @@ class SonarModel(NamedTuple):
     body_T_sonar: gtsam.Pose3
 
     @classmethod
-    def of(cls, calibration: Calibration, gate_probability: float) -> "SonarModel":
-        """The model of a calibration."""
+    def of(cls, calibration: Calibration, params: FilterParams) -> "SonarModel":
+        """The model of a calibration and a filter's settings."""
         sonar, floor = calibration.sonar, calibration.floor
         return cls(
             body_R_sonar=np.ascontiguousarray(sonar.mounting.pose().rotation().matrix()),
             body_p_sonar=np.array(sonar.mounting.translation_m),
-            gate=gate_threshold(gate_probability, 2),
+            gate=Gate.of(params),
             aperture_rad=sonar.elevation_aperture_rad,
             R_z=np.diag([sonar.range_sigma_m**2, sonar.azimuth_sigma_rad**2]),
             floor_z_m=floor.z_m if floor else math.nan,
@@ -283,16 +336,9 @@ def polar_covariance(R_z: Floats, aperture_rad: float) -> Floats:
     return V
 
 
-@compiled
-def is_inside(e: Floats, S: Floats, gate: float) -> bool:
-    """True where ``e^T S^-1 e`` of range and azimuth is within a gate."""
-    squared = S[1, 1] * e[0] ** 2 - 2.0 * S[0, 1] * e[0] * e[1] + S[0, 0] * e[1] ** 2
-    return bool(squared / (S[0, 0] * S[1, 1] - S[0, 1] ** 2) <= gate)
-
-
 def far_view(
     missed: Floats, cov: Floats, G_z: Floats, sonar: SonarModel, z: Floats, R_z: Floats
-) -> tuple[Floats, Floats, Floats] | None:
+) -> tuple[int, Floats, Floats, Floats] | None:
     """Compare a landmark with the point seen, which is linear in both positions; None where `observe` is linear enough.
 
     With the variances A along the beam and L across it, in the sonar's plane, the linearisation at the predicted place
@@ -309,7 +355,8 @@ def far_view(
 
     Returns
     -------
-    The covariance with the noise of the detection (3, 3); the innovation of range and azimuth (2,) and its covariance.
+    Outcome by `admit`; the covariance with the noise of the detection (3, 3); the innovation of range and azimuth (2,)
+    and its covariance.
     """
     r, along, across = z[0], G_z[:, 0], G_z[:, 1]
     A, L_r2 = along @ cov @ along, across @ cov @ across
@@ -320,7 +367,9 @@ def far_view(
     cov = cov + G_z @ V @ G_z.T
     cov = 0.5 * (cov + cov.T)
     B = np.array([along, across / r**2])  # range and azimuth by the point
-    return cov, B @ missed, B @ cov @ B.T
+    e, S = B @ missed, B @ cov @ B.T
+    outcome, widened = admit(e, S, R_z, sonar.gate)
+    return outcome, cov + G_z[:, :2] @ widened @ G_z[:, :2].T, e, S
 
 
 # ------------------------------------------------------------------------------------------------- the shell
@@ -340,7 +389,7 @@ class FilterShell(ABC):
     def __init__(self, calibration: Calibration, odometry: MotionSource, params: FilterParams) -> None:
         require_source(odometry, calibration, f"{type(self).__name__}(calibration, odometry, params)")
         self.calibration, self.odometry = calibration, odometry
-        self.sonar = SonarModel.of(calibration, params.gate_probability)
+        self.sonar = SonarModel.of(calibration, params)
         self.port = np.array(calibration.depth.port_m)
         self._minimum_id_probability, earth = params.minimum_id_probability, earth_rate_in_world(calibration)
         self.earth, self._has_rate = np.zeros(3) if earth is None else earth, self.has_bias or earth is not None
@@ -372,10 +421,10 @@ class FilterShell(ABC):
     @abstractmethod
     def observe(
         self, motion: Motion, slot: int, z: Floats, R_z: Floats, *, may_be_far: bool
-    ) -> tuple[bool, Floats, Floats]:
-        """Update by range and azimuth of a known landmark, a motion after the state, where the gate admits it.
+    ) -> tuple[int, Floats, Floats]:
+        """Update by range and azimuth of a known landmark, a motion after the state, where `admit` does.
 
-        Returns whether it was used, the innovation (2,) and its covariance (2, 2). ``may_be_far``: the Doppler log has
+        Returns the outcome's number, the innovation (2,) and its covariance (2, 2). ``may_be_far``: the Doppler log has
         lost the bottom, and landmarks may be far from where they are predicted (`far_view`).
         """
 
@@ -452,6 +501,20 @@ class FilterShell(ABC):
     def detections(self) -> DetectionLog:
         """Outcome of each detection so far."""
         return self._journal.log()
+
+    def withheld(self) -> list[str]:
+        """Message about detections that a gate would have kept out, of most that it saw (`admit`)."""
+        log = self.detections()
+        let_in = [
+            stamp for stamp, why in zip(log.stamps_ns.tolist(), log.outcomes, strict=True) if why is Outcome.LET_IN
+        ]
+        if not let_in:
+            return []
+        return [
+            f"most of {JUDGED_TOGETHER} detections in a row were outliers, first at {let_in[0]} ns, so {len(let_in)}"
+            " were used outside the gate: the filter was wrong, not they, and the gate may be the cause; give"
+            " gate_probability = 1, or larger noise"
+        ]
 
     def refused_rows(self) -> list[RefusedRow]:
         """Rows of IMU, Doppler log and depth that are not used, with the reason."""
@@ -582,5 +645,5 @@ class FilterShell(ABC):
                 self._slots[landmark_id], views.outcome[row] = len(self._slots), NEW
                 continue
             slot = self._slots[landmark_id]
-            is_used, views.e[row], views.S[row] = self.observe(motion, slot, z, R_z, may_be_far=self._was_lost)
-            views.outcome[row] = USED if is_used else GATED
+            told = self.observe(motion, slot, z, R_z, may_be_far=self._was_lost)
+            views.outcome[row], views.e[row], views.S[row] = told

@@ -11,14 +11,15 @@ from baselines import invariant_equations as equations
 from baselines.filter import (
     DEPTH,
     EPOCH,
+    GATED,
     GRAVITY,
     Events,
     FilterParams,
     FilterShell,
     Motion,
     add_force,
+    admit,
     far_view,
-    is_inside,
     polar_covariance,
     up_at_end,
 )  # fmt: skip
@@ -131,7 +132,7 @@ class InvariantEkf(FilterShell):
 
     def observe(
         self, motion: Motion, slot: int, z: Floats, R_z: Floats, *, may_be_far: bool
-    ) -> tuple[bool, Floats, Floats]:
+    ) -> tuple[int, Floats, Floats]:
         """Update by range and azimuth of a known landmark, (5), or the point seen where it may be far away, (6)."""
         state, k = self._state, 1 + slot
         if may_be_far:
@@ -142,19 +143,18 @@ class InvariantEkf(FilterShell):
             HP, S = equations.innovation_covariance(state, H, G_m @ motion.C @ G_m.T)
             view = far_view(missed, S, G_z, self.sonar, z, R_z)
             if view is not None:
-                S, e, S_view = view
-                is_used = is_inside(e, S_view, self.sonar.gate)
-                if is_used:
+                outcome, S, e, S_view = view
+                if outcome != GATED:
                     equations.correct(state, HP, S, missed)
-                return is_used, e, S_view
+                return outcome, e, S_view
         predicted, H, H_m = equations.observation(state, k, motion, self.sonar)
         e = z - predicted
         e[1] = wrap_angle(e[1])
         HP, S = equations.innovation_covariance(state, H, H_m @ motion.C @ H_m.T + R_z)
-        is_used = is_inside(e, S, self.sonar.gate)
-        if is_used:
-            equations.correct(state, HP, S, e)
-        return is_used, e, S
+        outcome, widened = admit(e, S, R_z, self.sonar.gate)
+        if outcome != GATED:
+            equations.correct(state, HP, S + widened, e)
+        return outcome, e, S
 
     def augment(self, motion: Motion, z: Floats, R_z: Floats) -> None:
         """Append a landmark seen for the first time, (6), on a floor of known height within the floor's gate."""

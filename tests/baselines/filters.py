@@ -16,6 +16,7 @@ from baselines.invariant_equations import InvariantState
 from sonar_graph.calibration import Calibration, DepthCalibration, Mounting, SonarCalibration
 from sonar_graph.measurements import NS_PER_S, Floats
 from sonar_graph.navigation import Odometry
+from sonar_graph.slam.models import GaussianKernel, KernelParams
 
 SONAR = Mounting(translation_m=(0.4, 0.1, -0.2), rpy_rad=(0.1, 0.5, -0.2))
 PORT = np.array([0.1, 0.2, -0.3])
@@ -186,10 +187,15 @@ both = pytest.mark.parametrize("filter_", [Ekf, Invariant], ids=["ekf-slam", "in
 
 
 def begun(
-    filter_: Any, world: World, P: Floats | None = None, calibration: Calibration = CALIBRATION, gate: float = 0.999
+    filter_: Any,
+    world: World,
+    P: Floats | None = None,
+    calibration: Calibration = CALIBRATION,
+    gate: float = 0.999,
+    kernel: KernelParams = GaussianKernel(),  # noqa: B008
 ) -> FilterShell:
     """A filter with an estimate and a covariance, by default `random_covariance`."""
-    slam = filter_.kind(calibration, Odometry(calibration), filter_.kind.Params(gate_probability=gate))
+    slam = filter_.kind(calibration, Odometry(calibration), filter_.kind.Params(gate_probability=gate, kernel=kernel))
     n = filter_.bare + world.landmarks.size
     filter_.begin(slam, world, random_covariance(n) if P is None else P)
     return slam

@@ -307,7 +307,7 @@ def test_a_question_while_beams_are_few_changes_nothing_later(kind):
 @slam_filters
 def test_each_detection_has_its_outcome_and_a_refused_one_changes_nothing(kind):
     """Before the first node, without a probable identity, older than what is done, and outside the gate."""
-    slam = begun(kind, Calibration())
+    slam = begun(kind, Calibration(), gate_probability=0.999)
     assert slam.process(Measurements(T0_NS - 5, None, None, None, seen([T0_NS - 10]))) is None
     end_ns = later(1.0)
     slam.process(Measurements(end_ns, imu(1), dvl(1), None, seen([later(0.5)])))
@@ -324,6 +324,32 @@ def test_each_detection_has_its_outcome_and_a_refused_one_changes_nothing(kind):
     assert log.innovations[4] == pytest.approx([0.5, 0.0], abs=1e-6)
     assert np.isnan(log.innovations[:4]).all()
     assert slam.landmarks().ids.tolist() == [3]
+
+
+@slam_filters
+def test_a_filter_that_refuses_what_most_detections_say_says_so_and_follows_them(kind):
+    """A landmark stands 0.5 m farther than first seen; however the log is cut, and not after one outlier."""
+    t = np.concatenate([[0.5], np.arange(1.0, 9.0, 0.25)])
+    far_m, states = 2.0 + 0.5 * (t >= 2.0), []
+    for cuts in ((9.0,), (1.6, 4.1, 4.2, 9.0)):
+        slam, before_ns = begun(kind, Calibration(), gate_probability=0.999), T0_NS - 1
+        for end_ns in (later(cut) for cut in cuts):
+            rows = [block.between(before_ns, end_ns) for block in (imu(9), dvl(9), seen(later(*t), range_m=far_m))]
+            slam.process(Measurements(end_ns, rows[0], rows[1], None, rows[2]))
+            before_ns = end_ns
+        states.append(state_of(slam))
+    for part, same in zip(*states, strict=True):
+        assert_array_equal(part, same)
+    outcomes = slam.detections().outcomes
+    assert outcomes[5:10] == [Outcome.GATED] * 5
+    assert outcomes[10] is Outcome.LET_IN
+    assert outcomes[-1] is Outcome.USED
+    assert np.abs(slam.detections().innovations[-1, 0]) < 0.1
+    (message,) = slam.withheld()
+    assert f"first at {later(t[10])} ns" in message
+    assert "the gate may be the cause" in message
+    calm = run(kind, Sequence("one outlier", Calibration(), imu(9), dvl(9), None, seen(later(*t), 2.0 + (t == 4.0))))
+    assert calm.withheld() == []
 
 
 @slam_filters

@@ -8,13 +8,26 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from baselines.filter import SonarModel, far_view, is_inside, read
+from baselines.filter import (
+    GATED,
+    JUDGED_TOGETHER,
+    LET_IN,
+    OUTLYING,
+    USED,
+    FilterParams,
+    Gate,
+    SonarModel,
+    admit,
+    far_view,
+    read,
+)
 from sonar_graph.calibration import FloorPrior, SonarCalibration
 from sonar_graph.measurements import NS_PER_S
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 from sonar_graph.slam.landmarks.association import gate_threshold
+from sonar_graph.slam.models import GaussianKernel, RobustKernel
 from sonar_graph.slam.models.sonar_model import FLOOR_GATE, elevation_on_floor
 from sonar_graph.slam.models.views import locate, range_azimuth
 from sonar_graph.testing.numerical import central_differences
@@ -94,8 +107,8 @@ def test_a_new_landmark_has_the_covariance_of_many_draws(filter_):
 def test_an_innovation_has_the_covariance_of_many_draws(filter_):
     rng = np.random.default_rng(7)
     world, P, z = with_landmark(filter_)
-    is_used, e, S = begun(filter_, world, P).observe(MOTION, 0, z + np.array([0.01, -0.005]), NOISE, may_be_far=False)
-    assert is_used
+    outcome, e, S = begun(filter_, world, P).observe(MOTION, 0, z + np.array([0.01, -0.005]), NOISE, may_be_far=False)
+    assert outcome == USED
     assert_allclose(e, [0.01, -0.005], atol=1e-9)
     views = []
     for _ in range(20_000):
@@ -154,8 +167,8 @@ def test_the_floor_s_gate_is_passed_by_999_of_1000_that_stand_on_it():
 def test_a_gated_detection_changes_nothing_and_has_its_innovation(filter_):
     world, P, z = with_landmark(filter_)
     slam = begun(filter_, world, P)
-    is_used, e, S = slam.observe(MOTION, 0, z + np.array([1.0, 0.0]), NOISE, may_be_far=False)
-    assert not is_used
+    outcome, e, S = slam.observe(MOTION, 0, z + np.array([1.0, 0.0]), NOISE, may_be_far=False)
+    assert outcome == GATED
     assert e[0] == pytest.approx(1.0)
     assert np.linalg.eigvalsh(S).min() > 0
     after, covariance = filter_.estimate(slam)
@@ -167,8 +180,8 @@ def test_a_gated_detection_changes_nothing_and_has_its_innovation(filter_):
 def test_the_innovation_of_azimuth_wraps_around(filter_):
     world, P, _ = with_landmark(filter_, view=(3.0, math.pi - 0.004, 0.1))
     slam = begun(filter_, world, P)
-    is_used, e, _ = slam.observe(MOTION, 0, np.array([3.0, -math.pi + 0.004]), NOISE, may_be_far=False)
-    assert is_used
+    outcome, e, _ = slam.observe(MOTION, 0, np.array([3.0, -math.pi + 0.004]), NOISE, may_be_far=False)
+    assert outcome == USED
     assert e[1] == pytest.approx(0.008, abs=1e-9)
 
 
@@ -189,7 +202,7 @@ AHEAD = CALIBRATION.model_copy(update={"sonar": SonarCalibration(elevation_apert
 def look(filter_, X, position_sigma_m, may_be_far, wrong_m=0.0):
     """One exact look at the landmark from X, by a filter that expects to be at the origin.
 
-    Returns whether it was used, position and covariance after it, the innovation and its covariance.
+    Returns its outcome, position and covariance after it, the innovation and its covariance.
     """
     here = World(np.eye(3), np.zeros(3), FAR_LANDMARK[None])
 
@@ -200,17 +213,17 @@ def look(filter_, X, position_sigma_m, may_be_far, wrong_m=0.0):
     P = T @ np.diag(np.repeat(np.square([position_sigma_m, 1e-3, 0.01]), 3)) @ T.T
     slam, q = begun(filter_, here, P, AHEAD), FAR_LANDMARK - X
     z = np.array([np.linalg.norm(q) + wrong_m, np.arctan2(q[1], q[0])])
-    is_used, e, S = slam.observe(STILL, 0, z, slam.sonar.R_z, may_be_far=may_be_far)
+    outcome, e, S = slam.observe(STILL, 0, z, slam.sonar.R_z, may_be_far=may_be_far)
     _, at, covariance = slam.pose_after(STILL)
-    return is_used, at, covariance[3:, 3:], e, S
+    return outcome, at, covariance[3:, 3:], e, S
 
 
 @both
 def test_one_look_finds_a_vehicle_that_is_far_from_where_it_was_expected(filter_):
     """And linearised where it was expected it is sure of a wrong place."""
     X = np.array([40.0, 20.0, -0.5])
-    is_used, at, P, _, S = look(filter_, X, 30.0, may_be_far=True)
-    assert is_used
+    outcome, at, P, _, S = look(filter_, X, 30.0, may_be_far=True)
+    assert outcome == USED
     assert np.linalg.norm((at - X)[:2]) < 0.5
     assert (at - X) @ np.linalg.solve(P, at - X) < chi2.ppf(0.99, 3)
     assert S[0, 0] == pytest.approx(30.0**2, rel=0.01)
@@ -228,15 +241,15 @@ def test_a_vehicle_near_where_it_was_expected_sees_as_without_a_gap(filter_):
 
 @both
 def test_what_no_vehicle_in_reach_sees_is_refused(filter_):
-    is_used, at, _, e, S = look(filter_, np.array([40.0, 20.0, -0.5]), 30.0, True, wrong_m=300.0)
-    assert not is_used
+    outcome, at, _, e, S = look(filter_, np.array([40.0, 20.0, -0.5]), 30.0, True, wrong_m=300.0)
+    assert outcome == GATED
     assert_allclose(at, 0.0, atol=1e-15)
     assert e @ np.linalg.solve(S, e) > gate_threshold(0.999, 2)
 
 
 def far(cov, G_z, range_m, noise, missed=(0.0, 0.0, 0.0), aperture_rad=APERTURE_RAD):
     """`far_view` of a detection with this covariance of range and azimuth; None where it is linear enough."""
-    sonar = SonarModel.of(AHEAD, 0.999)._replace(aperture_rad=aperture_rad)
+    sonar = SonarModel.of(AHEAD, FilterParams(kernel=GaussianKernel()))._replace(aperture_rad=aperture_rad)
     return far_view(np.array(missed), np.array(cov), G_z, sonar, np.array([range_m, 0.0]), np.array(noise))
 
 
@@ -244,11 +257,11 @@ def test_the_noise_of_a_view_holds_that_of_many_beams_and_without_aperture_is_th
     """Of elevations anywhere in the aperture, for a length that is taken at elevation zero."""
     elevation = np.random.default_rng(3).uniform(-APERTURE_RAD / 2, APERTURE_RAD / 2, 200_000)
     wide = 1e3 * np.eye(3)
-    V = far(wide, np.eye(3), 40.0, np.zeros((2, 2)))[0] - wide
+    V = far(wide, np.eye(3), 40.0, np.zeros((2, 2)))[1] - wide
     assert V[0, 0] == pytest.approx(np.mean(np.square(40.0 * (1 - np.cos(elevation)))), rel=0.02)
     assert V[2, 2] == pytest.approx(np.var(elevation), rel=0.02)
     noise = np.array([[0.04, -0.003], [-0.003, 0.0009]])
-    V = far(1e6 * np.eye(3), np.eye(3), 40.0, noise, aperture_rad=0.0)[0] - 1e6 * np.eye(3)
+    V = far(1e6 * np.eye(3), np.eye(3), 40.0, noise, aperture_rad=0.0)[1] - 1e6 * np.eye(3)
     assert_allclose(V, np.pad(noise, (0, 1)), atol=1e-9)
 
 
@@ -269,7 +282,7 @@ TURNED = Rotation.from_euler("xyz", [0.4, -0.7, 1.9]).as_matrix()
 def test_a_shift_and_what_is_linear_are_the_same_wherever_the_sonar_points(range_m):
     """Of range and azimuth, blind to elevation; with 0.3 m along and 0.2 m across, 2 % on each side of linear."""
     G_z, cov = TURNED @ np.diag([1.0, range_m, range_m]), TURNED @ np.diag([0.09, 0.04, 4.0]) @ TURNED.T
-    shift = far(1e6 * np.eye(3), G_z, range_m, np.eye(2), G_z @ [0.3, 0.02, 5.0])[1]
+    shift = far(1e6 * np.eye(3), G_z, range_m, np.eye(2), G_z @ [0.3, 0.02, 5.0])[2]
     assert_allclose(shift, [0.3, 0.02], atol=1e-12)
     longer_m, turned_rad = 0.04 / (2 * range_m), 0.3 * 0.2 / range_m**2
     for share, is_linear in ((0.98, False), (1.02, True)):
@@ -280,10 +293,59 @@ def test_a_shift_and_what_is_linear_are_the_same_wherever_the_sonar_points(range
 @pytest.mark.parametrize("direction", [(2.0, 1.0), (2.0, -1.0), (1.0, 0.0)])
 def test_the_gate_is_an_ellipse_of_a_correlated_innovation(direction):
     """Range and azimuth correlated by 0.9: along the long axis far more passes than across it."""
-    S, gate = np.array([[4.0, 1.8], [1.8, 1.0]]), gate_threshold(0.999, 2)
-    e = np.array(direction) * np.sqrt(gate / (direction @ np.linalg.solve(S, direction)))
-    assert is_inside(0.999 * e, S, gate)
-    assert not is_inside(1.001 * e, S, gate)
+    S, threshold = np.array([[4.0, 1.8], [1.8, 1.0]]), gate_threshold(0.999, 2)
+    e = np.array(direction) * np.sqrt(threshold / (direction @ np.linalg.solve(S, direction)))
+    assert admitted(0.999 * e, S, gate_probability=0.999)[0] == USED
+    assert admitted(1.001 * e, S, gate_probability=0.999)[0] == GATED
+    assert admitted(1e3 * e, S)[0] == USED
+
+
+def admitted(e, S, R_z=NOISE, **params):
+    """Judgement of the first detection by these settings."""
+    return admit(np.array(e), np.array(S), R_z, Gate.of(FilterParams(**params)))
+
+
+@pytest.mark.parametrize("shape", ["cauchy", "huber"])
+def test_a_kernel_weighs_range_and_azimuth_each_as_in_the_graph(shape):
+    """By GTSAM's own weight at the innovation over its sigma; a correlation of the noise stays as it is."""
+    kernel, R_z = RobustKernel(shape=shape, width=1.2), np.array([[4e-4, 1e-5], [1e-5, 1e-4]])
+    S, weight = np.array([[0.04, 0.01], [0.01, 0.09]]), kernel.estimator().weight
+    for e in ([0.6, 0.3], [-0.1, -3.0], [0.0, 0.0], [1e4, 1e4]):
+        outcome, widened = admitted(e, S, R_z, kernel=kernel)
+        spread = [weight(abs(e[i]) / math.sqrt(S[i, i])) ** -0.5 for i in range(2)]
+        assert outcome == USED
+        assert_allclose(R_z + widened, R_z * np.outer(spread, spread), rtol=1e-12)
+    assert_array_equal(admitted([9.0, 9.0], S, R_z, kernel=GaussianKernel())[1], 0.0)
+
+
+@both
+def test_an_outlier_moves_a_filter_with_a_kernel_less_and_what_agrees_as_much(filter_):
+    world, P, z = with_landmark(filter_)
+    for off, shares in ((0.0, (1.0, 1.0)), (1.0, (0.0, 0.1))):
+        moved = []
+        for kernel in (GaussianKernel(), RobustKernel()):
+            slam = begun(filter_, world, P, gate=1.0, kernel=kernel)
+            slam.observe(MOTION, 0, z + np.array([1e-6 + off, 0.0]), NOISE, may_be_far=False)
+            moved.append(np.linalg.norm(filter_.estimate(slam)[0].landmarks - world.landmarks))
+        assert shares[0] - 1e-3 < moved[1] / moved[0] < shares[1] + 1e-3
+
+
+def test_a_gate_refuses_a_few_outliers_and_opens_when_most_are():
+    """Of the last ten; it closes again when most are not. One in a thousand right ones is an outlier."""
+    gate, S = Gate.of(FilterParams(gate_probability=0.99)), np.eye(2)
+
+    def judge(squared, times=1):
+        return [admit(np.array([math.sqrt(squared), 0.0]), S, NOISE, gate) for _ in range(times)]
+
+    assert JUDGED_TOGETHER == 10
+    assert pytest.approx(chi2.ppf(0.999, 2)) == OUTLYING
+    told = judge(1.0, 7) + judge(100.0, 8)
+    assert [outcome for outcome, _ in told] == [USED] * 7 + [GATED] * 5 + [LET_IN] * 3
+    assert not np.any([widened for outcome, widened in told if outcome == LET_IN])
+    assert [outcome for outcome, _ in judge(1.0, 5) + judge(100.0)] == [USED] * 5 + [GATED]
+    always = Gate.of(FilterParams(gate_probability=0.99))  # outside the gate, but no outliers
+    told = [admit(np.array([math.sqrt(OUTLYING - 0.1), 0.0]), S, NOISE, always)[0] for _ in range(20)]
+    assert told == [GATED] * 20
 
 
 BEFORE_S, LOST_S, AFTER_S = 25.0, 120.0, np.array([3.0, 10.0, 20.0])

@@ -9,7 +9,7 @@ mixture_policy.py    policy "max-mixture", of the log densities and votes in mix
 """
 
 # fmt: off
-from sonar_graph.slam.landmarks.association import ACCEPTED, gate_threshold, identify
+from sonar_graph.slam.landmarks.association import ACCEPTED, MINIMUM_PROBABILITY, gate_threshold, identify
 from sonar_graph.slam.landmarks.landmark_graph import AmendableJournal, IdentityPolicy, LandmarkGraph
 from sonar_graph.slam.landmarks.mixture_policy import IdentityParams, MixtureIdentities, MixtureIdentity
 from sonar_graph.slam.landmarks.sighting import Screened, SeenFrame, SightingFactors
@@ -18,6 +18,6 @@ from sonar_graph.slam.landmarks.unknown import AssociatedUnknown, NamelessLandma
 
 __all__ = [
     "ACCEPTED", "AmendableJournal", "AssociatedUnknown", "GatedIdentity", "IdentityParams", "IdentityPolicy",
-    "LandmarkGraph", "MixtureIdentities", "MixtureIdentity", "NamelessLandmarks", "RobustIdentity", "Screened",
-    "SeenFrame", "SightingFactors", "TrackedIdentities", "gate_threshold", "identify",
+    "LandmarkGraph", "MINIMUM_PROBABILITY", "MixtureIdentities", "MixtureIdentity", "NamelessLandmarks",
+    "RobustIdentity", "Screened", "SeenFrame", "SightingFactors", "TrackedIdentities", "gate_threshold", "identify",
 ]

@@ -12,6 +12,8 @@ from sonar_graph.states import OUTCOME_NUMBERS, Outcome
 
 ACCEPTED = -1
 """In place of an outcome."""
+MINIMUM_PROBABILITY = 0.7
+"""Default of every estimator: a wrong identity, which may spoil a landmark for good, weighs more than a lost one."""
 NO_IDENTITY, REPEATED = OUTCOME_NUMBERS[Outcome.NO_IDENTITY], OUTCOME_NUMBERS[Outcome.REPEATED]
 UNSOUND = OUTCOME_NUMBERS[Outcome.UNSOUND]
 

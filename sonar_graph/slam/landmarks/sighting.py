@@ -18,6 +18,7 @@ from sonar_graph.slam.keyframes import Keyframes
 from sonar_graph.slam.models import (
     FLOOR_GATE,
     PredictedView,
+    Robust,
     Source,
     elevation_on_floor,
     factors,
@@ -65,7 +66,7 @@ def beam_point(world_T_sonar: gtsam.Pose3, z: Floats, elevation_rad: float = 0.0
 class SightingFactors:
     """Makes the factors of sightings, with noise models that a kernel wraps."""
 
-    def __init__(self, sonar: SonarCalibration, robust: factors.Robust) -> None:
+    def __init__(self, sonar: SonarCalibration, robust: Robust) -> None:
         self.elevation_sigma_rad = sonar.elevation_aperture_rad / math.sqrt(12.0)
         """Standard deviation of an elevation that is uniform over the aperture."""
         self._aperture_rad = sonar.elevation_aperture_rad

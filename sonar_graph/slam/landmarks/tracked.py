@@ -17,7 +17,7 @@ from pydantic import Field
 from sonar_graph.calibration import Section
 from sonar_graph.measurements import NO_TRACK, LandmarkDetections
 from sonar_graph.slam.estimates import Solution
-from sonar_graph.slam.landmarks.association import ACCEPTED, gate_threshold, identify
+from sonar_graph.slam.landmarks.association import ACCEPTED, MINIMUM_PROBABILITY, gate_threshold, identify
 from sonar_graph.slam.landmarks.landmark_graph import Assignment, LandmarkGraph
 from sonar_graph.slam.landmarks.sighting import Screened, SeenFrame, Sighting, beam_point, late_view
 from sonar_graph.slam.landmarks.unknown import IgnoredUnknown, NamelessLandmarks, UnknownParams, unnamed
@@ -64,7 +64,7 @@ def second_rows_of_tracks(frame: LandmarkDetections, identities: Mapping[int, in
 class TrackedIdentity(Section):
     """Settings of identities that are believed track by track."""
 
-    minimum_probability: float = Field(0.7, ge=0, le=1)
+    minimum_probability: float = Field(MINIMUM_PROBABILITY, ge=0, le=1)
     """Least posterior of the most probable identity with which a detection is used."""
     longest_wait_s: float = Field(60.0, ge=0)
     """Longest time for which a detection waits for the identity of its track. When the identity changes, all detections

@@ -1,7 +1,7 @@
-"""Sonar model (`sonar_model`, `views`), factors (`factors`, `inertial_factors`), predicted frames (`prediction`)."""
+"""Sonar model (`sonar_model`, `views`), `kernels`, factors (`factors`, `inertial_factors`), predicted frames."""
 
 # fmt: off
-from sonar_graph.slam.models.factors import GaussianKernel, Kernel, KernelParams, Robust, RobustKernel
+from sonar_graph.slam.models.kernels import GaussianKernel, Kernel, KernelParams, Robust, RobustKernel
 from sonar_graph.slam.models.prediction import PredictedView, Source
 from sonar_graph.slam.models.sonar_model import (
     FLOOR_GATE, elevation_on_floor, project, sonar_point, sonar_point_jacobian, wrap_angle,
