@@ -53,10 +53,10 @@ def made(kind: type[Estimator], calibration: Calibration, params: Any = None) ->
 
 
 def filters(calibration: Calibration) -> list[Estimator]:
-    """Both filters, without a gate."""
+    """Both filters, with Gaussian noise."""
     return [
-        made(EkfSlam, calibration, EkfSlamParams(gate_probability=1)),
-        made(InvariantEkf, calibration, InvariantEkfParams(gate_probability=1)),
+        made(EkfSlam, calibration, EkfSlamParams(kernel=GaussianKernel())),
+        made(InvariantEkf, calibration, InvariantEkfParams(kernel=GaussianKernel())),
     ]
 
 

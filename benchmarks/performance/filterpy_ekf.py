@@ -21,11 +21,9 @@ from sonar_graph.motion import PreintegratedMotion
 from sonar_graph.navigation import Odometry
 from sonar_graph.navigation.alignment import gravity_direction
 from sonar_graph.sequence import Sequence
-from sonar_graph.slam.landmarks import ACCEPTED, gate_threshold, identify
+from sonar_graph.slam.landmarks import ACCEPTED, MINIMUM_PROBABILITY, identify
 from sonar_graph.slam.models import FLOOR_GATE, elevation_on_floor, locate_jacobians, range_azimuth_jacobians
 
-GATE_PROBABILITY = 0.999
-MINIMUM_ID_PROBABILITY = 0.5
 GRAVITY_INTERVAL_NS = NS_PER_S
 NO_BIAS = np.zeros(3)
 
@@ -137,11 +135,7 @@ class FilterpySlam:
         H = np.zeros((2, len(self.ekf.x)))
         H[:, :6], H[:, at : at + 3] = by_body @ T, by_landmark
         R = R + by_body @ motion.covariance @ by_body.T
-        e = z - predicted
-        e[1] = math.remainder(e[1], 2 * math.pi)
-        S = H @ self.ekf.P @ H.T + R
-        if e @ np.linalg.solve(S, e) <= gate_threshold(GATE_PROBABILITY, 2):
-            self.update(z, predicted, H, R, wrapped=(1,))
+        self.update(z, predicted, H, R, wrapped=(1,))
 
     def augment(self, motion: PreintegratedMotion, landmark: int, z: Floats, R: Floats) -> None:
         """Append a landmark."""
@@ -232,7 +226,7 @@ class _Feed:
         detections = self.sequence.detections
         assert detections is not None
         one = detections.rows(slice(row, row + 1))
-        ids, outcomes = identify(one, MINIMUM_ID_PROBABILITY)
+        ids, outcomes = identify(one, MINIMUM_PROBABILITY)
         if outcomes[0] != ACCEPTED:
             return
         sonar = self.slam.calibration.sonar

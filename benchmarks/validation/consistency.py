@@ -1,8 +1,8 @@
-"""Are EKF-SLAM and iSAM2 as sure as they are right? NEES over independent runs of the nominal basin without bias.
+"""Are EKF-SLAM and iSAM2 as sure as they are right? NEES over independent runs of the nominal basin.
 
-Each seed is a basin of its own: route, sensor noise, start, landmark heights. The normalised squared error (NEES) of
-position (3 numbers) and heading is averaged over the seeds at each instant (ANEES, per degree of freedom: 1 is
-consistent). Instants of one run are correlated, seeds are not, so three things are said:
+Each seed is a basin of its own: route, sensor noise, biases as calibrated, start, landmark heights. The normalised
+squared error (NEES) of position (3 numbers) and heading is averaged over the seeds at each instant (ANEES, per degree
+of freedom: 1 is consistent). Instants of one run are correlated, seeds are not, so three things are said:
 
 * the ANEES at the last instant, with its two-sided 95 % band for this many runs;
 * the ANEES over all instants, with a 95 % interval from the spread of the runs' own averages, which should hold 1;
@@ -44,9 +44,7 @@ class Basin:
 
 def run_seed(basin: Basin, seed: int) -> tuple[np.ndarray, Nees]:
     """Seconds since the start (n,), and NEES (n,) by estimator and quantity."""
-    options = BasinOptions(
-        seed=seed, gyro_bias_scale=0, accel_bias_scale=0, duration_s=basin.duration_s, laps=basin.laps
-    )
+    options = BasinOptions(seed=seed, duration_s=basin.duration_s, laps=basin.laps)
     sequence = simulate_basin(options)
     comparison = compare(sequence, list(ESTIMATORS.values()), rate_hz=RATE_HZ)
     for run in comparison.runs:
@@ -101,7 +99,7 @@ def draw(seconds: np.ndarray, nees: Nees, path: Path) -> None:
         axes.set_ylabel(f"ANEES of {quantity} / {dof}")
         axes.legend(loc="upper left", ncols=3)
     axes.set_xlabel("time (s)")
-    figure.suptitle(f"{runs} runs of the basin without bias")
+    figure.suptitle(f"{runs} runs of the basin")
     figure.savefig(path, dpi=120)
 
 

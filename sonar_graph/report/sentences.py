@@ -168,11 +168,13 @@ def lost_runs(comparison: Comparison) -> list[str]:
         outcomes = run.detections.outcomes if run.detections else []
         gated = outcomes.count(Outcome.GATED)
         if gated > GATED_SHARE * max(len(outcomes), 1):
-            advice = ' (try identity.policy = "max-mixture")' if flattened(run.params).get(POLICY) == "gate" else ""
+            is_smoother = flattened(run.params).get(POLICY) == "gate"
+            advice = ' (try identity.policy = "max-mixture")' if is_smoother else ""
+            without = 'identity.policy = "robust"' if is_smoother else "gate_probability = 1"
             said.append(
                 f"{run.estimator} refused {gated} of {len(outcomes)} detections as outside its gate: it has lost its "
-                f"way, identities are wrong{advice}, or noise is set far too small; its NIS only tells of what "
-                "the gate let through."
+                f"way, identities are wrong{advice}, or noise is set far too small, and the gate may keep it there "
+                f"(try {without}); its NIS only tells of what the gate let through."
             )
     return said
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from baselines import ekf_equations, invariant_equations
-from baselines.filter import FilterParams, SonarModel, correction
+from baselines.filter import USED, FilterParams, SonarModel, correction
 from sonar_graph.calibration import DepthCalibration, PlanarMotion, Start
 from sonar_graph.navigation import Odometry
 from sonar_graph.slam.models.views import locate, range_azimuth
@@ -117,8 +117,8 @@ def test_updates_by_a_detection_and_by_depth_are_the_textbook_s(filter_, angles,
     H, H_m = numerical(
         lambda true, eps: range_azimuth(sonar_after(true, motion, eps), true.landmarks[1]), filter_, world, [1]
     )
-    is_used, innovation, S = slam.observe(motion, 1, view[:2] + e, R_z, may_be_far=False)
-    assert is_used
+    outcome, innovation, S = slam.observe(motion, 1, view[:2] + e, R_z, may_be_far=False)
+    assert outcome == USED
     assert_allclose(innovation, e, atol=1e-9)
     assert_covariance(S, H @ P @ H.T + H_m @ C @ H_m.T + R_z)
     assert_corrected(filter_, slam, world, P, H, H_m @ C @ H_m.T + R_z, e)
