@@ -271,6 +271,16 @@ def test_mrclam_names_its_figures(recordings):
     assert {"ekf_causal_ate_m", "landmark_error_m", "passed"} <= set(found)
 
 
+@pytest.mark.slow
+def test_fairness_has_a_row_for_each_choice_and_tells_some_apart():
+    worlds, names = ("--worlds", "basin0.001", "--estimators", "ekf-slam,invariant-ekf"), ("default", "no kernel")
+    rows = figures("validation/fairness.py", *worlds, "--choices", ",".join(names), "--workers", "1")["rows"]
+    assert [(row["estimator"], row["choice"]) for row in rows] == [
+        (estimator, name) for estimator in ("ekf-slam", "invariant-ekf") for name in names
+    ]
+    assert len({row["landmarks.se2_m"] for row in rows}) == 4
+
+
 FIGURES = ("smoothed", "causal", "landmarks", "time_s")
 
 

@@ -143,7 +143,7 @@ def main() -> None:
         refuse(f"--worlds, --estimators: unknown: {', '.join(sorted(unknown))}")
     choices, duration_s, seeds = arguments.choices, 1000.0, range(arguments.seeds)
     if arguments.quick:
-        asked, choices, duration_s, seeds = [worlds[0], worlds[-1]], "default,gate", 120.0, range(1)
+        choices, duration_s, seeds = choices or "default,gate", 120.0, range(1)
     cases: list[Case] = []
     for world in asked:
         numbers = ROBOTS[int(world.removeprefix("mrclam"))] if world.startswith("mrclam") else seeds
