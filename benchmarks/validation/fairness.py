@@ -73,7 +73,7 @@ Scores = dict[str, float]
 
 def basin(bias_rad_s: float, seed: int, duration_s: float) -> Sequence:
     """A basin whose gyros have a bias of this sigma."""
-    nominal = simulate_basin(BasinOptions(seed=0, duration_s=60.0, laps=1)).calibration.imu.gyro_bias_sigma
+    nominal = simulate_basin(BasinOptions(duration_s=120.0, laps=1)).calibration.imu.gyro_bias_sigma
     options = BasinOptions(
         seed=seed, duration_s=duration_s, laps=max(1, round(duration_s / 333.0)), gyro_bias_scale=bias_rad_s / nominal,
         tracks=True, id_delay_s=5.0, wrong_id_rate=0.1,
@@ -124,7 +124,9 @@ def collect(cases: list[Case], runs: list[Scores]) -> list[dict[str, Any]]:
             values = [run[key] for run in chosen if key in run]
             mean = float(np.mean(values)) if values else math.nan
             row[key] = mean if math.isfinite(mean) else None
-        row["worst_map_m"] = max((v for run in chosen if math.isfinite(v := run["landmarks.se2_m"])), default=None)
+        row["worst_map_m"] = max(
+            (v for run in chosen if math.isfinite(v := run.get("landmarks.se2_m", math.nan))), default=None
+        )
         row["lost"] = sum(not max(run.values()) <= LOST_M for run in chosen)
         rows.append(row)
     return rows
