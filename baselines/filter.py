@@ -601,7 +601,8 @@ class FilterShell(ABC):
         for epoch_ns in epochs_ns:
             duration_s, (velocity_i, variance_i) = (epoch_ns - self._opened_ns) * 1e-9, self._opened_velocity
             velocity_j, variance_j = self._opened_velocity = self.odometry.velocity_at_imu(epoch_ns)
-            sigma = tilt_sigma(duration_s, math.sqrt(0.5 * (variance_i + variance_j)), self.calibration)
+            velocity_sigma = math.sqrt(0.5 * (variance_i + variance_j))
+            sigma = tilt_sigma(duration_s, velocity_sigma, self.calibration, has_bias=not self.has_bias)
             intervals.append((*velocity_i.tolist(), *velocity_j.tolist(), duration_s, sigma))
             self._opened_ns = epoch_ns
         return np.array(intervals)

@@ -1,4 +1,4 @@
-"""Right-invariant EKF-SLAM with the gyro bias in its state, the strongest filter here to compare with.
+"""Right-invariant EKF-SLAM with the biases of gyros and accelerometers in its state, the strongest filter here.
 
 Equations: `baselines.invariant_equations`; docs/theory/invariant_ekf.md.
 """
@@ -26,7 +26,7 @@ from baselines.filter import (
 from baselines.invariant_equations import BARE, BETA, BODY, EYE, THETA, UP, InvariantState
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
 from sonar_graph.measurements import Floats
-from sonar_graph.motion import MotionSource
+from sonar_graph.motion import BIASES, MotionSource, bias_sigmas, gyro_bias_of
 from sonar_graph.slam.models import FLOOR_GATE, wrap_angle
 
 
@@ -35,18 +35,19 @@ class InvariantEkfParams(FilterParams):
 
 
 class InvariantEkf(FilterShell):
-    """Right-invariant extended Kalman filter over pose, gyro bias and landmarks.
+    """Right-invariant extended Kalman filter over pose, biases and landmarks.
 
     Same measurements, gates, floor and gaps as `baselines.ekf_slam.EkfSlam`, with three differences:
 
     - The error is right-invariant, in the world's frame. The unobservable directions, position and heading of the
       world, are then the same at every estimate, and no linearisation gains information along them (Barrau and
       Bonnabel, 2015; Zhang, Wu, Song, Huang and Dissanayake, RA-L 2(2), 2017).
-    - The gyro bias is a state that walks; every motion has its derivative by the bias, also over gaps.
+    - The biases of gyros and accelerometers are states that walk; a scale error of the Doppler log is a constant one.
+      Every motion has its derivatives by them, also over gaps.
     - Attitude is a rotation matrix and has no singular pitch.
 
-    It linearises once, cannot revise an association, and has no accelerometer bias: the sigma of gravity's direction is
-    widened instead. Derivation: docs/theory/invariant_ekf.md.
+    It linearises once, and cannot revise an association. Derivation: docs/theory/invariant_ekf.md; what gravity tells:
+    docs/theory/gravity.md.
 
     Parameters
     ----------
@@ -65,14 +66,15 @@ class InvariantEkf(FilterShell):
         self, calibration: Calibration, odometry: MotionSource, params: InvariantEkfParams | None = None
     ) -> None:
         super().__init__(calibration, odometry, params or InvariantEkfParams())
-        has_bias = calibration.imu.gyro_bias_sigma > 0
-        self._walk_density = calibration.imu.gyro_bias_walk_density if has_bias else 0.0
+        self._walk_density = bias_sigmas(calibration)[1]
         self._state = start_state(calibration)
 
     def state(self) -> tuple[int, InvariantState]:
         """Stamp (ns) and a copy of the state at the newest epoch."""
         s = self._state
-        return self.node_ns, InvariantState(s.R.copy(), s.points.copy(), s.bias.copy(), s.P.copy())
+        return self.node_ns, InvariantState(
+            s.R.copy(), s.points.copy(), s.bias.copy(), s.P.copy(), s.body_p_dvl, s.is_levelled
+        )
 
     def attitude(self) -> Floats:
         """world_R_body of the state, shape (3, 3)."""
@@ -82,7 +84,7 @@ class InvariantEkf(FilterShell):
 
     def gyro_bias(self) -> Floats:
         """Estimated gyro bias, shape (3,), rad/s."""
-        return self._state.bias
+        return gyro_bias_of(self._state.bias, self._state.up())
 
     def predict(self, motion: Motion, duration_s: float) -> None:
         """Carry the state over the motion to the next epoch, (2) and (3)."""
@@ -93,9 +95,10 @@ class InvariantEkf(FilterShell):
         while events.kind[k] in (EPOCH, GRAVITY, DEPTH) and not np.isnan(events.dp[k, 0]):
             motion, row = self.motion_to(events, k), events.row[k]
             if events.kind[k] == GRAVITY:
+                mean_R = 0.5 * (EYE + self.turned.T)
                 up = up_at_end(self.turned, self.impulse, events.gravity[row])
                 if not np.isnan(up[0]):
-                    self.correct_up(up, events.gravity[row, 7])
+                    self.correct_up(up, events.gravity[row, 7], mean_R / self.calibration.gravity_m_s2)
             elif events.kind[k] == EPOCH:
                 self.predict(motion, (events.end_ns[k] - events.start_ns[k]) * 1e-9)
                 add_force(self.turned, self.impulse, motion.dR, motion.impulse)
@@ -107,9 +110,9 @@ class InvariantEkf(FilterShell):
             k += 1
         return k
 
-    def correct_up(self, up: Floats, sigma: float) -> None:
+    def correct_up(self, up: Floats, sigma: float, by_accel: Floats) -> None:
         """Update by the world's up in the body, shape (3,), with the sigma of its tilt, rad, (8)."""
-        y, H = equations.up_innovation(self._state, up)
+        y, H = equations.up_innovation(self._state, up, by_accel)
         equations.correct(self._state, *equations.innovation_covariance(self._state, H, sigma**2 * np.eye(2)), y)
 
     def correct_height(self, k: int, z_m: float, variance_m2: float, gate: float = np.inf) -> None:
@@ -122,7 +125,7 @@ class InvariantEkf(FilterShell):
     def correct_plane(self, plane: PlanarMotion) -> None:
         """Update by the plane on which the vehicle stays: height and tilt."""
         self.correct_height(0, plane.z_m, plane.z_sigma_m**2)
-        self.correct_up(UP, plane.tilt_sigma_rad)
+        self.correct_up(UP, plane.tilt_sigma_rad, np.zeros((3, 3)))
 
     def correct_depth(self, motion: Motion, z_m: float, variance_m2: float) -> None:
         """Update by the height of the pressure port a motion after the state, (7)."""
@@ -183,5 +186,8 @@ def start_state(calibration: Calibration) -> InvariantState:
     A, P = np.zeros((BARE, 6)), np.zeros((BARE, BARE))
     A[THETA, :3], A[BODY, :3], A[BODY, 3:] = R, equations.hat(X) @ R, EYE
     P = A @ np.diag(np.square((*start.rpy_sigma_rad, *start.position_sigma_m))) @ A.T
-    P[BETA, BETA] = EYE * calibration.imu.gyro_bias_sigma**2
-    return InvariantState(R, X[None].copy(), np.zeros(3), equations.symmetric(P))
+    P[BETA, BETA] = np.diag(bias_sigmas(calibration)[0] ** 2)
+    body_p_dvl = np.array(calibration.dvl.mounting.translation_m)
+    return InvariantState(
+        R, X[None].copy(), np.zeros(BIASES), equations.symmetric(P), body_p_dvl, calibration.use_gravity
+    )

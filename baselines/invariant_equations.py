@@ -1,7 +1,7 @@
 """Equations of the right-invariant EKF: state and error, prediction, measurement models, update, augmentation.
 
-The state is a rotation and 1 + N points that turn with the world, one element of SE_{1+N}(3), and a gyro bias. The
-error is right-invariant::
+The state is a rotation and 1 + N points that turn with the world, one element of SE_{1+N}(3), and the biases b of
+`sonar_graph.motion`. The error is right-invariant::
 
     R = Exp(theta) R^,    x_k = Exp(theta) x_k^ + J_l(theta) xi_k,    b = b^ + beta                            (1)
 
@@ -29,27 +29,29 @@ Height of ``a = X' + R' q``, k = 0, or of a landmark ``a = x_k``, of which H_m i
 
     H_theta = (a x e_z)^T,    H_xi_k = e_z^T,    H_m = e_z^T R' Q(q)                                           (7)
 
-Direction u of the world's up in the body, and the innovation covariance::
+Direction u of the world's up in the body, tilted by A times the bias a of the accelerometers, and the innovation
+covariance::
 
-    y = (R u)_xy = [ -theta_y, theta_x ] + noise                                                               (8)
+    y = (R (u - A a))_xy = [ -theta_y, theta_x ] + (R A beta_a)_xy + noise                                     (8)
     S = H P H^T + H_m C H_m^T + R_z                                                                            (9)
 
 Every H is zero along a shift of everything in x and y and a turn about the vertical, at any estimate, so these
 unobservable directions stay unobservable. Derivation: docs/theory/invariant_ekf.md.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from baselines.filter import Motion, SonarModel, correction
 from sonar_graph.measurements import Floats
+from sonar_graph.motion import ACCEL, BIASES, SCALE, by_biases
 from sonar_graph.numerics import compiled, exp_and_mean, store, vec
 from sonar_graph.slam.models import project, sonar_point, sonar_point_jacobian
 
-THETA, BETA, BODY = slice(0, 3), slice(3, 6), slice(6, 9)
+THETA, BETA, BODY = slice(0, 3), slice(3, 3 + BIASES), slice(3 + BIASES, 6 + BIASES)
 """Places of theta, beta and xi_0 in xi."""
-BARE, POINT = 9, 3
+BARE, POINT = 6 + BIASES, 3
 """Length of xi without landmarks, and of one xi_k."""
 UP, EYE = np.array([0.0, 0.0, 1.0]), np.eye(3)
 SKEWS = np.array([np.cross(e, EYE).T.ravel() for e in EYE])
@@ -65,9 +67,21 @@ class InvariantState:
     points: Floats
     """Positions of the body and of the landmarks, shape (1 + N, 3), m."""
     bias: Floats
-    """Of the gyros, body axes, shape (3,), rad/s."""
+    """b of `sonar_graph.motion`, shape (11,)."""
     P: Floats
-    """Covariance of xi, shape (9 + 3 N, 9 + 3 N)."""
+    """Covariance of xi, shape (17 + 3 N, 17 + 3 N)."""
+    body_p_dvl: Floats = field(default_factory=lambda: np.zeros(3))
+    """Doppler log in the body, shape (3,), m."""
+    is_levelled: bool = True
+    """True where gravity levels the vehicle."""
+
+    def up(self) -> Floats:
+        """The world's up in the body as it splits the gyros' bias, shape (3,)."""
+        return self.R[2] if self.is_levelled else np.zeros(3)
+
+    def D(self, motion: Motion) -> Floats:
+        """Derivative of a motion from the state by the biases, shape (6, 9)."""
+        return by_biases(motion.D, motion.dR, motion.dp, self.up(), self.body_p_dvl)
 
 
 def place_of(k: int) -> slice:
@@ -99,24 +113,26 @@ def retract(state: InvariantState, xi: Floats) -> None:
 
 
 def pose(state: InvariantState, motion: Motion) -> tuple[Floats, Floats]:
-    """R' and X', a motion after the state, (2)."""
-    return state.R @ motion.dR, state.points[0] + state.R @ motion.dp
+    """R' and X', a motion after the state, (2), without the scale error of the Doppler log."""
+    R = state.R @ motion.dR
+    return R, state.points[0] + state.R @ motion.dp + R @ (state.D(motion)[3:, SCALE] * state.bias[SCALE])
 
 
-def predict(state: InvariantState, motion: Motion, walk_variance: float) -> None:
+def predict(state: InvariantState, motion: Motion, walk_variance: Floats) -> None:
     """Carry estimate and covariance over a motion, (2) and (3).
 
-    ``walk_variance`` is the variance of the bias walk since, each component, rad²/s².
+    ``walk_variance`` is the variance of the biases' walk since, shape (11,).
     """
+    D = state.D(motion)
     state.R, state.points[0] = pose(state, motion)
     P, J = state.P, np.zeros((len(state.P), 6))
     J[THETA, :3] = J[BODY, 3:] = state.R
     J[BODY.start :, :3] = hat(state.points) @ state.R
     # P <- F P F^T + J C J^T with F = I + J D E, where E picks beta: P + M + M^T
-    JD = J @ motion.D
+    JD = J @ D
     M = JD @ (P[BETA] + 0.5 * P[BETA, BETA] @ JD.T) + J @ (0.5 * motion.C) @ J.T
     P += M + M.T
-    P[BETA, BETA] += walk_variance * EYE
+    P[BETA, BETA] += np.diag(walk_variance)
 
 
 def pose_covariance(state: InvariantState, motion: Motion) -> Floats:
@@ -128,7 +144,7 @@ def pose_covariance(state: InvariantState, motion: Motion) -> Floats:
     A = np.zeros((6, BARE))
     A[:3, THETA] = A[3:, BODY] = R.T
     A[3:, THETA] = -R.T @ hat(X)
-    A[:, BETA] = motion.D
+    A[:, BETA] = state.D(motion)
     return symmetric(A @ state.P[:BARE, :BARE] @ A.T + motion.C)
 
 
@@ -152,7 +168,7 @@ def observation(state: InvariantState, k: int, motion: Motion, sonar: SonarModel
     N = D_q @ sonar.body_R_sonar.T
     H, H_m = np.zeros((2, len(state.P))), -N @ Q(q)
     H[:, place_of(k)], H[:, BODY] = N @ R.T, -N @ R.T
-    H[:, BETA] = H_m @ motion.D  # (4)
+    H[:, BETA] = H_m @ state.D(motion)  # (4)
     return z, H, H_m
 
 
@@ -168,7 +184,7 @@ def location(
     q = sonar.body_p_sonar + sonar.body_R_sonar @ sonar_point(z[0], z[1], elevation_rad)
     G, G_m = np.zeros((3, len(state.P))), R @ Q(q)
     G[:, BODY] = EYE
-    G[:, BETA] = G_m @ motion.D  # (4)
+    G[:, BETA] = G_m @ state.D(motion)  # (4)
     return X + R @ q, G, G_m, R @ sonar.body_R_sonar @ sonar_point_jacobian(z[0], z[1], elevation_rad)
 
 
@@ -178,7 +194,7 @@ def height_of_body_point(state: InvariantState, motion: Motion, q: Floats) -> tu
     a = X + R @ q
     H, H_m = np.zeros((1, len(state.P))), R[2:] @ Q(q)
     H[0, THETA], H[0, BODY] = (a[1], -a[0], 0.0), UP  # a x e_z
-    H[:, BETA] = H_m @ motion.D  # (4)
+    H[:, BETA] = H_m @ state.D(motion)  # (4)
     return a[2], H, H_m
 
 
@@ -189,11 +205,12 @@ def height_of_point(state: InvariantState, k: int) -> tuple[float, Floats]:
     return a[2], H
 
 
-def up_innovation(state: InvariantState, up: Floats) -> tuple[Floats, Floats]:
-    """Innovation y (2,) and H (2, 9 + 3 N) of (8)."""
-    H = np.zeros((2, len(state.P)))
+def up_innovation(state: InvariantState, up: Floats, by_accel: Floats) -> tuple[Floats, Floats]:
+    """Innovation y (2,) and H (2, 15 + 3 N) of (8); ``by_accel``: A, shape (3, 3)."""
+    H, by_bias = np.zeros((2, len(state.P))), state.R @ by_accel
     H[:, :2] = (0.0, -1.0), (1.0, 0.0)
-    return (state.R @ up)[:2], H
+    H[:, BETA][:, ACCEL] = by_bias[:2]
+    return (state.R @ up - by_bias @ state.bias[ACCEL])[:2], H
 
 
 def innovation_covariance(state: InvariantState, H: Floats, noise: Floats) -> tuple[Floats, Floats]:
@@ -211,7 +228,7 @@ def augmented(state: InvariantState, x: Floats, G: Floats, noise: Floats) -> Inv
     """The state with a new landmark x, (6); ``noise`` is ``G_m C G_m^T`` and that of z, shape (3, 3)."""
     GP, own = innovation_covariance(state, G, noise)
     P = np.block([[state.P, GP.T], [GP, own]])
-    return InvariantState(state.R, np.vstack((state.points, x)), state.bias, P)
+    return InvariantState(state.R, np.vstack((state.points, x)), state.bias, P, state.body_p_dvl, state.is_levelled)
 
 
 def symmetric(A: Floats) -> Floats:

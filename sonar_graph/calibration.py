@@ -65,12 +65,16 @@ class ImuCalibration(Section):
     """White noise of angular rate, rad/s/√Hz."""
     gyro_bias_sigma: NotNegative = 5e-5
     """Bias left when the run starts, rad/s; 0: no bias is estimated."""
+    gyro_bias_rad_s: Vector = (0.0, 0.0, 0.0)
+    """Bias that is known, in the IMU's axes: every estimator takes it from the rows."""
     gyro_bias_walk_density: NotNegative = 1e-6
     """Random walk of the bias, rad/s²/√Hz."""
     accel_noise_density: NotNegative = 1.2e-3
     """White noise of specific force, m/s²/√Hz."""
     accel_bias_sigma: NotNegative = 1e-2
     """Bias of specific force, m/s²."""
+    accel_bias_walk_density: NotNegative = 2e-4
+    """Random walk of that bias, m/s³/√Hz."""
     turn_sigma_rad_s: Sigmas = (0.05, 0.05, 0.15)
     """Standard deviation of the vehicle's rate about each body axis, in IMU holes; 0: holes count as measured."""
     turn_time_s: tuple[Positive, Positive, Positive] = (0.5, 0.5, 1.5)
@@ -88,6 +92,10 @@ class DvlCalibration(Section):
     """Time without a sample above which there is a DVL gap, bridged by accelerometers."""
     velocity_walk_density: Positive = 0.1
     """Random walk of the vehicle's velocity, m/s/√s: for DVL gaps without accelerometers and the gate of outliers."""
+    scale_error: Annotated[Number, within(-0.2, 0.2, "a relative error between -0.2 and 0.2 (0.5 % are 0.005)")] = 0.0
+    """Known relative error of its velocities, 0.01 where they are 1 % too fast: taken from the rows."""
+    scale_sigma: NotNegative = 0.0
+    """Standard deviation of the relative error that is left; 0: none is estimated."""
 
 
 class DepthCalibration(Section):

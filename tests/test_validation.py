@@ -16,7 +16,12 @@ def told(text: str) -> str:
 @pytest.mark.parametrize(
     ("text", "place", "meant", "known"),
     [
-        ("gravitiy = 9.8", "gravitiy", "gravity_m_s2", "it has: imu, dvl, depth, sonar, start, floor, planar"),
+        (
+            "gravitiy = 9.8",
+            "gravitiy",
+            "gravity_m_s2",
+            "it has: imu, dvl, depth, heading, positions, sonar, start, floor, planar",
+        ),
         ("gravity = 9.8", "gravity", "gravity_m_s2", "it has: imu, dvl"),
         ("dvl.velocity_sigma = 1", "dvl.velocity_sigma", "velocity_sigma_m_s", "dvl has: velocity_sigma_m_s, mounting"),
         ("imu.mounting.rpy = 1", "imu.mounting.rpy", "rpy_rad", "imu.mounting has: translation_m, rpy_rad"),

@@ -44,8 +44,8 @@ class AnchoredPose:
         key, motion = X(self.keyframe), self.motion.i_T_j
         J = np.zeros((6, len(joint.matrix)))
         if self.bias_key is not None:
-            motion, row = self.motion.corrected(values.atPoint3(self.bias_key)), joint.rows[self.bias_key]
-            J[:, row : row + 3] = self.motion.D_bias
+            motion, row = self.motion.corrected(values.atVector(self.bias_key)), joint.rows[self.bias_key]
+            J[:, row : row + len(self.motion.bias)] = self.motion.D_bias
         J[:, joint.rows[key] : joint.rows[key] + 6] = motion.inverse().AdjointMap()
         cov = J @ joint.matrix @ J.T + self.motion.covariance
         return Estimate(self.stamp_ns, values.atPose3(key).compose(motion), 0.5 * (cov + cov.T))

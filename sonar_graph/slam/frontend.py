@@ -12,7 +12,7 @@ from itertools import compress
 
 import numpy as np
 
-from sonar_graph.measurements import NO_TRACK, LandmarkDetections
+from sonar_graph.measurements import NO_TRACK, Floats, LandmarkDetections
 from sonar_graph.slam.estimates import Solution
 from sonar_graph.slam.keyframes import Keyframes
 from sonar_graph.slam.landmarks import (
@@ -62,6 +62,11 @@ class Frontend:
         for assignments in self.policy.assign(seen):
             self.landmarks.apply(assignments, self._keyframes.newest_s)
             self.update_if_due()
+
+    def add_fix(self, stamp_ns: int, position_m: Floats, cov_m2: Floats) -> None:
+        """Take in a position fix, which enters the estimate at once."""
+        self._keyframes.add_fix(stamp_ns, position_m, cov_m2)
+        self.update_if_due()
 
     def update_if_due(self) -> None:
         """Bring the smoother up to date, and the sightings in line with what it withheld and gave up."""

@@ -10,6 +10,7 @@ One call of `Isam2.process`::
 
 from bisect import bisect_left
 from collections.abc import Iterable
+from functools import partial
 from typing import Any, ClassVar, Literal, Self, get_args
 
 import gtsam
@@ -19,7 +20,7 @@ from pydantic import model_validator
 
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.errors import CalibrationError, EstimatorError
-from sonar_graph.measurements import NS_PER_S, Floats, Ints, Measurements
+from sonar_graph.measurements import NS_PER_S, Floats, Ints, Measurements, PositionFixes
 from sonar_graph.motion import MotionSource, require_source
 from sonar_graph.slam.estimates import AnchoredPose, PoseHistory
 from sonar_graph.slam.frontend import Frontend
@@ -27,7 +28,7 @@ from sonar_graph.slam.keyframes import KeyframeParams, Keyframes
 from sonar_graph.slam.landmarks import IdentityParams, MixtureIdentity, RobustIdentity
 from sonar_graph.slam.models import KernelParams, RobustKernel
 from sonar_graph.slam.smoother import HistoryParams, JointCovariance, Smoother, SmootherParams, WholeHistory
-from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, RefusedRow, Trajectory
+from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, Refusal, RefusedRow, Trajectory
 from sonar_graph.tagged_sections import misfits
 
 Over = Literal["window", "history"]
@@ -119,7 +120,7 @@ class Isam2:
 
     @property
     def values(self) -> gtsam.Values:
-        """The newest estimate of every variable: ``X(i)`` keyframes, ``L(id)`` landmarks, ``B(i)`` gyro biases.
+        """The newest estimate of every variable: ``X(i)`` keyframes, ``L(id)`` landmarks, ``B(i)`` biases.
 
         Of a bounded history those in the window.
         """
@@ -136,26 +137,44 @@ class Isam2:
         None before IMU and DVL have begun, and for an instant before that of an earlier call.
         """
         if self._asked.newest_ns is not None and measurements.end_ns < self._asked.newest_ns:
-            self._keyframes.add(measurements.imu, measurements.dvl, None)  # rows that are still new count
+            self._keyframes.add(measurements.imu, measurements.dvl)  # rows that are still new count
             if measurements.detections is not None:
                 stamps_ns, ids = measurements.detections.stamps_ns, measurements.detections.most_probable()[0]
                 for stamp_ns, landmark_id in zip(stamps_ns.tolist(), ids.tolist(), strict=True):
                     self._sightings.journal.record(stamp_ns, landmark_id, Outcome.LATE)
             return None
-        self._keyframes.add(measurements.imu, measurements.dvl, measurements.depth)
-        if measurements.detections is not None:
-            for frame in measurements.detections.frames():
-                self._sightings.advance(int(frame.stamps_ns[0]))
-                self._sightings.add(frame)
+        self._keyframes.add(measurements.imu, measurements.dvl, measurements.depth, measurements.heading)
+        frames = [] if measurements.detections is None else list(measurements.detections.frames())
+        fixes = [] if measurements.positions is None else self._fixes(measurements.positions)
+        for stamp_ns, take_in in sorted(
+            [(int(frame.stamps_ns[0]), partial(self._sightings.add, frame)) for frame in frames] + fixes,
+            key=lambda event: event[0],
+        ):
+            self._sightings.advance(stamp_ns)
+            take_in()
         self._sightings.advance(measurements.end_ns)
         if self._keyframes.newest_ns is None:
             return None
         self._forget()
         motion = self._keyframes.motion_since_newest(measurements.end_ns)
         newest = len(self._keyframes.stamps_ns) - 1
-        instant = AnchoredPose(measurements.end_ns, newest, self._keyframes.bias_key(newest), motion)
+        instant = AnchoredPose(measurements.end_ns, newest, self._keyframes.bias_keys[newest], motion)
         self._asked.add(instant)
         return instant.carried_on(self._smoother.values, self._smoother.joint_covariance(instant.keys()))
+
+    def _fixes(self, positions: PositionFixes) -> list[tuple[int, partial[None]]]:
+        """What to do with each sound position fix, with its stamp."""
+        sigma_m = self._keyframes.calibration.positions.sigma_m
+        found: list[tuple[int, partial[None]]] = []
+        known = zip(positions.stamps_ns.tolist(), positions.are_sound().tolist(), strict=True)
+        for k, (stamp_ns, is_sound) in enumerate(known):
+            if not is_sound:
+                self._keyframes.refuse("positions", stamp_ns, Refusal.UNSOUND)
+                continue
+            cov_m2 = positions.covariance_m2[k]
+            cov_m2 = np.diag(np.square(sigma_m)) if np.isnan(cov_m2).any() else cov_m2
+            found.append((stamp_ns, partial(self._sightings.add_fix, stamp_ns, positions.position_m[k], cov_m2)))
+        return found
 
     def _forget(self) -> None:
         """Drop old poses and outcomes of a bounded history, in batches."""
@@ -293,5 +312,5 @@ class Isam2:
         return list(self._smoother.withheld)
 
     def refused_rows(self) -> list[RefusedRow]:
-        """Rows of IMU, Doppler log and depth that are not used, and why."""
-        return self._keyframes.odometry.refused
+        """Rows of all sensors but the sonar that are not used, and why."""
+        return self._keyframes.refused

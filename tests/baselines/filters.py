@@ -26,7 +26,8 @@ CALIBRATION = Calibration(
 )
 NOISE = np.diag([0.02**2, 0.01**2])
 BODY_M, LANDMARKS = np.array([1.0, -2.0, 0.5]), np.array([[4.0, -1.0, -1.7], [-2.0, 6.0, -2.5]])
-BIAS, D_BIAS, NOTHING = np.array([1e-3, -2e-3, 3e-3]), np.random.default_rng(11).normal(size=(6, 3)), np.zeros(6)
+BIAS = np.array([1e-3, -2e-3, 3e-3, 2e-3, 1e-3, -3e-3, 0.02, 0.01, -0.03, 0.04, 0.0])
+D_BIAS, NOTHING = np.random.default_rng(11).normal(size=(6, 3)), np.zeros(6)
 TWIST = np.array([0.02, -0.01, 0.05, 0.1, 0.02, -0.01])
 MOTION_SIGMA, MOTION_COV = 1e-3, 1e-6 * np.eye(6)
 
@@ -73,8 +74,17 @@ STILL = motion_of(np.zeros(6), np.zeros((6, 6)))
 
 
 def pose_after(world: World, motion: Motion, eps: Floats = NOTHING) -> gtsam.Pose3:
-    """True pose after a motion perturbed by [theta, rho] in its last frame, to which the bias adds."""
-    eps = eps + motion.D @ (world.bias - BIAS)
+    """True pose after a motion perturbed by [theta, rho] in its last frame, to which the biases add.
+
+    The gyros' turns about the world's vertical by the second, all else by the first; a scale error shortens the way.
+    """
+    off = world.bias - BIAS
+    tilting, turning, scale = off[:3], off[3:6], off[10]
+    up_i = world.R.T @ [0.0, 0.0, 1.0]
+    up_j = motion.dR.T @ up_i
+    theta = motion.D[:3] @ tilting + up_j * (up_j @ motion.D[:3] @ (turning - tilting))
+    rho = motion.D[3:] @ (tilting + up_i * (up_i @ (turning - tilting))) - scale * motion.dR.T @ motion.dp
+    eps = eps + np.concatenate([theta, rho])
     i_T_j = gtsam.Pose3(gtsam.Rot3(motion.dR @ rotation(eps[:3])), motion.dp + motion.dR @ eps[3:])
     return gtsam.Pose3(gtsam.Rot3(world.R), world.X).compose(i_T_j)
 
@@ -148,7 +158,7 @@ class Ekf:
 class Invariant:
     """The invariant filter; its error moves the world, by the matrix exponential of the group."""
 
-    kind, bare = InvariantEkf, 9
+    kind, bare = InvariantEkf, 17
 
     @staticmethod
     def begin(slam: Any, world: World, P: Floats) -> None:
@@ -169,10 +179,10 @@ class Invariant:
         size = 3 + len(points)
         algebra, element = np.zeros((size, size)), np.eye(size)
         algebra[:3, :3] = gtsam.SO3.Hat(xi[:3])
-        algebra[:3, 3:] = xi[6:].reshape(-1, 3).T
+        algebra[:3, 3:] = xi[14:].reshape(-1, 3).T
         element[:3, :3], element[:3, 3:] = world.R, points.T
         moved = (expm(algebra) @ element)[:3]
-        return World(moved[:, :3], moved[:, 3], moved[:, 4:].T, world.bias + xi[3:6])
+        return World(moved[:, :3], moved[:, 3], moved[:, 4:].T, world.bias + xi[3:14])
 
     @staticmethod
     def error(true: World, estimate: World) -> Floats:

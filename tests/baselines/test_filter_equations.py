@@ -42,7 +42,7 @@ from .filters import (
 )
 
 C, ANGLES = random_covariance(6, 0.01, 7), np.array([0.3, -0.5, 2.0])
-INVARIANT_XI, UP = np.zeros(15), np.array([0.0, 0.0, 1.0])
+INVARIANT_XI, UP = np.zeros(23), np.array([0.0, 0.0, 1.0])
 
 
 def numerical(function, filter_, world, angles=()):
@@ -205,8 +205,8 @@ def test_roll_has_the_variance_of_the_tilt_over_the_squared_cosine_of_the_pitch(
 
 @given(attitudes, st.one_of(triples(*[st.floats(-1.7, 1.7)] * 3), attitudes))
 def test_an_error_moves_the_estimate_by_the_group_s_exponential(angles, turn):
-    world, xi = world_at(angles), np.concatenate([turn, np.linspace(-0.2, 0.4, 12)])
-    expected, state = Invariant.moved(world, xi), Invariant.state(world, np.eye(15))
+    world, xi = world_at(angles), np.concatenate([turn, np.linspace(-0.2, 0.4, 20)])
+    expected, state = Invariant.moved(world, xi), Invariant.state(world, np.eye(23))
     invariant_equations.retract(state, xi)
     assert_allclose(state.R, expected.R, atol=1e-12)
     assert_allclose(state.points, np.vstack([expected.X, expected.landmarks]), atol=1e-11)
@@ -218,7 +218,7 @@ def test_every_jacobian_is_the_numerical_one(angles, twist, view, turn):
     """Of view, point seen, height and up: by xi and by the motion. The direction of up is the true one."""
     motion = motion_of(twist, C)
     world, sonar = in_view(angles, motion, view), SonarModel.of(CALIBRATION, FilterParams())
-    state = Invariant.state(world, np.eye(15))
+    state = Invariant.state(world, np.eye(23))
 
     def check(H, H_m, function, angles=()):
         check_derivative(lambda xi: function(Invariant.moved(world, xi), NOTHING), H, INVARIANT_XI, angles=angles)
@@ -243,17 +243,22 @@ def test_every_jacobian_is_the_numerical_one(angles, twist, view, turn):
     for k in range(3):
         _, H = invariant_equations.height_of_point(state, k)
         check(H, np.zeros((1, 6)), lambda true, _, k=k: np.vstack([true.X, true.landmarks])[k, 2:])
-    _, H = invariant_equations.up_innovation(state, np.array([np.cos(turn), np.sin(turn), 0.3]))
-    check(H, np.zeros((2, 6)), lambda true, _: invariant_equations.up_innovation(state, true.R.T @ UP)[0])
+    A = random_covariance(3, 0.3)
+    _, H = invariant_equations.up_innovation(state, np.array([np.cos(turn), np.sin(turn), 0.3]), A)
+
+    def tilt(true, _):
+        return invariant_equations.up_innovation(state, true.R.T @ UP + A @ true.bias[6:9], A)[0]
+
+    check(H, np.zeros((2, 6)), tilt)
 
 
 def test_the_bias_walks_where_there_is_one():
     slam, motion, duration_s = begun(Invariant, world_at(ANGLES)), motion_of(np.zeros(6), np.zeros((6, 6))), 4.0
     before = slam.state()[1].P
-    density = CALIBRATION.imu.gyro_bias_walk_density
+    walks = [CALIBRATION.imu.gyro_bias_walk_density] * 6 + [CALIBRATION.imu.accel_bias_walk_density] * 3 + [0.0] * 2
     predict(slam, motion._replace(D=np.zeros((6, 3))), duration_s)
-    walked = np.diag([0.0] * 3 + [density**2 * duration_s] * 3 + [0.0] * 9)
-    assert_allclose(slam.state()[1].P - before, walked, atol=1e-3 * walked.max())
+    walked = np.diag([0.0] * 3 + [density**2 * duration_s for density in walks] + [0.0] * 9)
+    assert_allclose(slam.state()[1].P - before, walked, atol=1e-15)
 
 
 @pytest.mark.parametrize("m", [1, 2, 5])
@@ -270,9 +275,9 @@ def test_a_correction_by_many_numbers_is_joseph_s_and_exactly_symmetric(seed, m)
 
 def gauge(axes):
     """Moves of the whole world along x and y (and z), and its turn about the vertical, as columns of xi."""
-    N = np.zeros((15, axes + 1))
+    N = np.zeros((23, axes + 1))
     N[2, axes] = 1.0
-    for at in (6, 9, 12):
+    for at in (14, 17, 20):
         N[at : at + axes, :axes] = np.eye(axes)
     return N
 
@@ -282,13 +287,13 @@ def test_no_measurement_tells_where_the_world_is_or_which_way_it_is_turned(angle
     """At any estimate, right or wrong: H N = 0 and F N = N with one and the same N. Height and tilt are told."""
     motion = motion_of(twist, np.zeros((6, 6)))
     world, sonar = in_view(angles, motion, view), SonarModel.of(CALIBRATION, FilterParams())
-    state, known = Invariant.state(world, np.eye(15)), gauge(3) @ gauge(3).T
+    state, known = Invariant.state(world, np.eye(23)), gauge(3) @ gauge(3).T
     H = np.vstack(
         [
             invariant_equations.observation(state, 2, motion, sonar)[1],
             invariant_equations.height_of_body_point(state, motion, PORT)[1],
             *(invariant_equations.height_of_point(state, k)[1] for k in range(3)),
-            invariant_equations.up_innovation(state, np.array([0.1, 0.2, 0.9]))[1],
+            invariant_equations.up_innovation(state, np.array([0.1, 0.2, 0.9]), np.eye(3) / 9.8)[1],
         ]
     )
     assert_allclose(H @ gauge(2), 0.0, atol=1e-10)
@@ -317,7 +322,7 @@ def test_only_the_invariant_filter_leaves_three_directions_open_at_any_estimates
 
         def told(world, _):
             views = [range_azimuth(sonar_after(world, still), at) for at in world.landmarks]
-            return np.array([*np.concatenate(views), world.X[2], *world.R[2]])
+            return np.array([*np.concatenate(views), world.X[2], *world.R[2], *world.bias[6:10]])
 
         def carried_error(world, _, after=carried(world, step)):  # noqa: B008
             return filter_.error(carried(world, step), after)

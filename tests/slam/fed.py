@@ -104,20 +104,20 @@ def in_the_basin(
     cov = np.diag([1e-4] * 3 + [4e-4] * 3)
     fed, truth, seen = Fed(lag_s, stale_shift_m), gtsam.Pose3(), set()
     fed.smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
-    fed.smoother.add_bias(B(0), np.zeros(3))
+    fed.smoother.add_bias(B(0), np.zeros(11))
     prior = gtsam.noiseModel.Diagonal.Sigmas(np.array([0.01] * 3 + [0.02] * 3))
     fed.add({"start prior": gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), prior)})
-    fed.add({"bias prior": factors.bias_prior(B(0), 0.01)})
+    fed.add({"bias prior": factors.bias_prior(B(0), np.full(11, 0.01))})
     for k in range(1, steps):
         truth = truth.compose(turn)
         moved = turn.compose(gtsam.Pose3.Expmap(np.sqrt(np.diag(cov)) * rng.standard_normal(6)))
-        motion = motion_of(moved, cov, -np.eye(6)[:, :3])
+        motion = motion_of(moved, cov, -np.eye(6, 11) * (np.arange(11) < 3))
         fed.smoother.add_pose(X(k), fed.smoother.values.atPose3(X(k - 1)).compose(moved), float(k))
         fed.add({"odometry": factors.odometry_with_bias(X(k - 1), X(k), B((k - 1) // bias_steps), motion)})
         if k % bias_steps == 0:
             new = k // bias_steps
-            fed.smoother.add_bias(B(new), fed.smoother.values.atPoint3(B(new - 1)))
-            fed.add({"bias walk": factors.bias_walk(B(new - 1), B(new), 0.003)})
+            fed.smoother.add_bias(B(new), fed.smoother.values.atVector(B(new - 1)))
+            fed.add({"bias walk": factors.bias_walk(B(new - 1), B(new), np.full(11, 0.003))})
         for i, p in landmarks.items():
             z = polar(truth.compose(SONAR), p) + [0.02, 0.009] * rng.standard_normal(2)
             if i not in seen:

@@ -119,14 +119,14 @@ def motion_of(
     i_T_j: gtsam.Pose3, cov: Floats, D_bias: Floats | None = None, bias: Floats | None = None
 ) -> PreintegratedMotion:
     """Motion of one second."""
-    D_bias, bias = (np.zeros((6, 3)) if D_bias is None else D_bias), (np.zeros(3) if bias is None else bias)
+    D_bias, bias = (np.zeros((6, 11)) if D_bias is None else D_bias), (np.zeros(11) if bias is None else bias)
     return PreintegratedMotion(i_T_j, cov, D_bias, bias, 1.0, np.zeros(3))
 
 
 def some_motion(seed: int = 0, sigma: float = 0.01) -> PreintegratedMotion:
     rng = np.random.default_rng(seed)
     i_T_j = gtsam.Pose3.Expmap(np.concatenate([0.3 * rng.standard_normal(3), 0.5 * rng.standard_normal(3)]))
-    D_bias, bias = rng.standard_normal((6, 3)), 0.01 * rng.standard_normal(3)
+    D_bias, bias = rng.standard_normal((6, 11)), 0.01 * rng.standard_normal(11)
     return motion_of(i_T_j, random_covariance(6, sigma, seed + 1), D_bias, bias)
 
 

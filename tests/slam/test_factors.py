@@ -44,19 +44,19 @@ def seen_from(pose: gtsam.Pose3, azimuth_rad: float, elevation_rad: float, range
 def beginnings(pose: gtsam.Pose3, rng: np.random.Generator) -> Made:
     """GTSAM's priors and directions have the derivative of where they are fulfilled."""
     seen = np.array([2.0, 0.3, -0.4])
-    values = values_of(X0=pose, B0=rng.standard_normal(3), B1=rng.standard_normal(3), L0=pose.transformFrom(seen))
+    values = values_of(X0=pose, B0=rng.standard_normal(11), B1=rng.standard_normal(11), L0=pose.transformFrom(seen))
     start = Start(position_m=tuple(pose.translation()), rpy_rad=tuple(pose.rotation().rpy()))
     yield factors.start_prior(X(0), Calibration(start=start)), values
-    yield factors.bias_prior(B(0), 0.1), values
-    yield factors.bias_walk(B(0), B(1), 0.1), values
+    yield factors.bias_prior(B(0), np.linspace(0.0, 0.1, 11)), values
+    yield factors.bias_walk(B(0), B(1), np.linspace(0.0, 0.1, 11)), values
     yield factors.floor_prior(L(0), -1.7, 0.01), values
     yield factors.first_direction(X(0), L(0), seen), values
 
 
 def odometries(pose: gtsam.Pose3, rng: np.random.Generator) -> Made:
     """Near no error, far off, and off by nearly half a turn."""
-    for spread, turn in ((0.0, 0.0), (1.0, 0.0), (0.1, np.pi - 0.01)):
-        motion, bias = some_motion(int(rng.integers(99)), 0.05), spread * 0.1 * rng.standard_normal(3)
+    for spread, turn in ((0.0, 0.0), (1.0, 0.0), (0.1, np.pi - 0.05)):
+        motion, bias = some_motion(int(rng.integers(99)), 0.05), spread * 0.03 * rng.standard_normal(11)
         X_j = pose.compose(motion.corrected(bias)).compose(gtsam.Pose3.Expmap(0.3 * spread * rng.standard_normal(6)))
         values = values_of(X0=pose, X1=X_j.compose(gtsam.Pose3(gtsam.Rot3.Rz(turn), np.zeros(3))), B0=bias)
         yield factors.odometry_with_bias(X(0), X(1), B(0), motion), values
@@ -84,6 +84,13 @@ def attitudes_and_heights(pose: gtsam.Pose3, rng: np.random.Generator) -> Made:
     yield from ((factor, values) for factor in factors.planar(X(0), PLANE).values())
     tilted = values_of(X0=pose.compose(gtsam.Pose3(tilt, np.zeros(3))))
     yield factors.gravity_direction(X(0), 9.8 * up_in_body, 0.01), tilted
+    tilted.insert(B(0), rng.standard_normal(11))
+    A = rng.standard_normal((3, 3)) / 9.8
+    yield factors.gravity_with_bias(X(0), B(0), 9.8 * up_in_body, A, 0.01), tilted
+    for yaw_rad in tilted.atPose3(X(0)).rotation().yaw() + np.array([0.0, 1.0, np.pi - 0.01, 0.01 - np.pi]):
+        yield factors.heading(X(0), B(0), yaw_rad + tilted.atVector(B(0))[9], 0.02, plain), tilted
+    fix = pose.translation() + rng.standard_normal(3)
+    yield factors.position(X(0), fix, np.array([0.3, -0.2, 0.5]), random_covariance(3, 0.4), plain), values
 
 
 def joint_odometries(pose: gtsam.Pose3, rng: np.random.Generator) -> Made:
@@ -110,7 +117,7 @@ def test_derivatives_are_those_of_differences(
 
 def test_odometry_error_is_what_the_pose_is_off_the_corrected_motion():
     """Zero where the second pose is the first moved by the corrected motion; else the perturbation from there."""
-    motion, pose, bias = some_motion(2, 0.05), POSES["random"], np.array([0.02, 0.0, -0.03])
+    motion, pose, bias = some_motion(2, 0.05), POSES["random"], 0.01 * np.arange(-5.0, 6.0)
     perturbation = np.array([0.01, -0.02, 0.03, 0.1, 0.2, -0.3])
     X_j = pose.compose(motion.i_T_j).compose(gtsam.Pose3.Expmap(motion.D_bias @ (bias - motion.bias)))
     factor = factors.odometry_with_bias(X(0), X(1), B(0), motion)

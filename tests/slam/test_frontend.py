@@ -111,7 +111,7 @@ def test_one_identity_twice_in_a_frame_counts_once():
     assert log.outcomes == [Outcome.NEW, Outcome.REPEATED, Outcome.NEW]
     assert log.landmark_ids.tolist() == [5, 5, 6]
     assert dive.sightings.landmarks.ids == [5, 6]
-    assert dive.smoother.graph.size() == 1 + 2 * 3
+    assert dive.smoother.graph.size() == 2 + 2 * 3
     dive.see(0.0, (5, 3.0, 0.0), (5, 3.01, 0.0))
     assert dive.outcomes[3:] == [Outcome.USED, Outcome.REPEATED]
 
@@ -166,7 +166,7 @@ def test_a_known_floor_gives_the_elevation():
     truth = np.array([2.6, 0.9, FLOOR.z_m])
     dive.see(0.0, (5, *spherical(0.0, truth)))
     assert dive.smoother.values.atPoint3(L(5)) == pytest.approx(truth, abs=1e-9)
-    assert dive.smoother.graph.size() == 1 + 4
+    assert dive.smoother.graph.size() == 2 + 4
     settle(dive)
     assert np.sqrt(dive.smoother.marginals.marginalCovariance(L(5))[2, 2]) == pytest.approx(FLOOR.sigma_m, rel=1e-3)
 

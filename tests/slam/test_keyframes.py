@@ -32,7 +32,7 @@ from .graphs import factors_of
 from .made import smoother_with
 
 G = 9.80665
-NO_BIAS = ImuCalibration(gyro_bias_sigma=0.0)
+NO_BIAS = ImuCalibration(gyro_bias_sigma=0.0, accel_bias_sigma=0.0)
 EXACT_DVL = DvlCalibration(velocity_sigma_m_s=(1e-7, 1e-7, 1e-7))
 POLICY = KeyframeParams(max_interval_s=2.0, motion_noise_share=1e9, bias_interval_s=10.0)
 
@@ -160,11 +160,11 @@ def test_with_no_share_every_frame_brings_one_if_a_node_was_reached_since():
 def test_every_keyframe_has_its_odometry_and_gravity_and_is_held_on_a_plane():
     keyframes = driven(Calibration(imu=NO_BIAS), 6.0)
     graph = keyframes.smoother.graph
-    assert graph.size() == 1 + 3 * 2
+    assert graph.size() == 2 + 3 * 2
     assert [len(factors_on(keyframes, gtsam.MagPoseFactorPose3, X(k))) for k in range(4)] == [0, 1, 1, 1]
-    assert [list(graph.at(k).keys()) for k in (1, 3, 5)] == [[X(0), X(1)], [X(1), X(2)], [X(2), X(3)]]
+    assert [list(graph.at(k).keys()) for k in (2, 4, 6)] == [[X(0), X(1)], [X(1), X(2)], [X(2), X(3)]]
     without = Calibration(imu=NO_BIAS, use_gravity=False)
-    assert driven(without, 6.0).smoother.graph.size() == 1 + 3
+    assert driven(without, 6.0).smoother.graph.size() == 2 + 3
     keyframes = driven(without.model_copy(update={"planar": PlanarMotion()}), 6.0)
     for kind in (gtsam.MagPoseFactorPose3, gtsam.GPSFactorArm):
         assert [len(factors_on(keyframes, kind, X(k))) for k in range(4)] == [1, 1, 1, 1]
@@ -229,7 +229,7 @@ def test_depths_of_a_turning_vehicle_are_carried_by_its_motion():
     )
     when = np.arange(0.15, 2.0, 0.25)
     keyframes = keyframes_of(calibration)
-    keyframes.bias = lambda _: np.array([bias, 0.0, 0.0])
+    keyframes.bias = lambda _: np.array([bias, 0.0, 0.0, bias, *np.zeros(7)])
     keyframes.add(
         level_imu(2.0, rate + np.array([bias, 0.0, 0.0])),
         steady_dvl(2.0, velocity),
@@ -275,13 +275,15 @@ def test_the_bias_walks_between_stretches():
     imu = ImuCalibration(gyro_bias_sigma=1e-3, gyro_bias_walk_density=1e-4)
     keyframes = driven(Calibration(imu=imu, use_gravity=False), 24.0)
     every = factors_of(keyframes.smoother.graph)
-    walks = [f for f in every if isinstance(f, gtsam.BetweenFactorPoint3)]
+    walks = [f for f in every if isinstance(f, gtsam.BetweenFactorVector)]
     assert [list(f.keys()) for f in walks] == [[B(0), B(1)], [B(1), B(2)]]
-    assert walks[0].noiseModel().sigmas() == pytest.approx([1e-4 * np.sqrt(10)] * 3)
+    assert walks[0].noiseModel().sigmas() == pytest.approx(
+        [*[1e-4 * np.sqrt(10)] * 3, *[0.0] * 3, *[2e-4 * np.sqrt(10)] * 3, 1e-3 * 0.05, 0.0], abs=1e-11
+    )
     odometry = [list(f.keys()) for f in every if f.size() == 3]
     assert odometry == [[X(k), X(k + 1), B(k // 5)] for k in range(12)]
-    assert [keyframes.bias_key(k) for k in (0, 4, 5, 12)] == [B(0), B(0), B(1), B(2)]
-    assert len(factors_on(keyframes, gtsam.PriorFactorPoint3, B(0))) == 1
+    assert [keyframes.bias_keys[k] for k in (0, 4, 5, 12)] == [B(0), B(0), B(1), B(2)]
+    assert len(factors_on(keyframes, gtsam.PriorFactorVector, B(0))) == 1
 
 
 def test_a_vehicle_that_turns_with_the_earth_stays_where_it_heads():

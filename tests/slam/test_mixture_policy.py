@@ -127,7 +127,7 @@ def largest(named: int, components: dict[int, dict], sighting) -> gtsam.CustomFa
 def test_the_end_is_a_fixed_point_of_the_max_mixture_that_another_solver_finds() -> None:
     world, truth = misnamed("max-mixture")
     values = world.sightings.smoothed().values
-    start = scattered(values, np.random.default_rng(1), {"x": 3e-3, "l": 3e-3})
+    start = scattered(values, np.random.default_rng(1), {"x": 3e-3, "l": 3e-3, "b": 0.0})
     found = gtsams_solution(max_mixture(world), start)
     for i in PLACES:
         assert np.linalg.norm(start.atPoint3(L(i)) - values.atPoint3(L(i))) > 1e-3

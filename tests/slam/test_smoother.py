@@ -56,9 +56,11 @@ def test_biases_in_a_row_are_least_squares(lag_s):
     for k in range(8):
         smoother.add_pose(X(k), gtsam.Pose3(), float(k))
         smoother.add({"prior": pose_prior(X(k), gtsam.Pose3(), 1.0)})
-        smoother.add_bias(B(k), np.zeros(3))
-        smoother.add({"walk": factors.bias_walk(B(k - 1), B(k), walk) if k else factors.bias_prior(B(0), sigma)})
-        smoother.add({"prior": point_prior(B(k), np.full(3, np.sin(k)), reading)})
+        smoother.add_bias(B(k), np.zeros(11))
+        walks, sigmas = np.full(11, walk), np.full(11, sigma)
+        smoother.add({"walk": factors.bias_walk(B(k - 1), B(k), walks) if k else factors.bias_prior(B(0), sigmas)})
+        told = gtsam.PriorFactorVector(B(k), np.full(11, np.sin(k)), isotropic(11, reading))
+        smoother.add({"prior": told})
         smoother.update(float(k))
         if k:
             A.append((np.eye(8)[k] - np.eye(8)[k - 1]) / walk)
@@ -67,8 +69,8 @@ def test_biases_in_a_row_are_least_squares(lag_s):
         b.append(np.sin(k) / reading)
     assert smoother.in_window([B(0), B(7)]) == ([B(0), B(7)] if lag_s == FOREVER_S else [B(7)])
     cov = np.linalg.inv(np.transpose(A) @ A)
-    assert smoother.values.atPoint3(B(7)) == pytest.approx([(cov @ np.transpose(A) @ b)[7]] * 3, abs=1e-9)
-    assert np.diag(smoother.marginals.marginalCovariance(B(7))) == pytest.approx([cov[7, 7]] * 3, abs=1e-9)
+    assert smoother.values.atVector(B(7)) == pytest.approx([(cov @ np.transpose(A) @ b)[7]] * 11, abs=1e-9)
+    assert np.diag(smoother.marginals.marginalCovariance(B(7))) == pytest.approx([cov[7, 7]] * 11, abs=1e-9)
 
 
 def test_covariances_are_computed_once_an_update_for_all_that_was_asked_for_lately(monkeypatch):
@@ -258,7 +260,7 @@ def test_a_restart_leaves_what_the_batch_gives(monkeypatch, lag_s):
     keys = [X(size - 1), L(3), L(5), L(8), B(0)]
     batch = solve(graph_of(fed.given), fed.smoother.values)
     for key in keys[1:]:
-        assert np.allclose(fed.smoother.values.atPoint3(key), batch.atPoint3(key), atol=1e-4)
+        assert np.allclose(fed.smoother.values.atVector(key), batch.atVector(key), atol=1e-4)
     assert fed.smoother.values.atPose3(keys[0]).equals(batch.atPose3(keys[0]), 1e-4)
     expected = fed.dense(batch, *keys)
     assert off_sigmas(fed.joint(*keys), expected) < 1e-3

@@ -131,6 +131,7 @@ class RowIntake:
         self._body_R_imu = _rotation(calibration.imu.mounting)
         self._body_R_dvl = _rotation(calibration.dvl.mounting)
         self._depth_gate, self._depth_variance = DepthGate(calibration), calibration.depth.sigma_m**2
+        self._gyro_bias, self._scale = np.array(calibration.imu.gyro_bias_rad_s), 1.0 + calibration.dvl.scale_error
         self._default_cov = np.diag(np.square(calibration.dvl.velocity_sigma_m_s))
         self._gate = np.inf if is_held else GATE
         self._walk = calibration.dvl.velocity_walk_density
@@ -167,6 +168,8 @@ class RowIntake:
             if not is_used.any():
                 return False
             rows, rate, force = rows.rows(is_used), rate[is_used], force[is_used]
+        if self._gyro_bias.any():
+            rate = rate - self._gyro_bias
         if self._body_R_imu is not None:
             rate, force = _turned(self._body_R_imu, rate), _turned(self._body_R_imu, force)
         return self.imu.insert(rows.stamps_ns, rate, force)
@@ -212,6 +215,8 @@ class RowIntake:
                 return False
             rows, cov = rows.rows(is_sound), cov[is_sound]
         velocity = rows.velocity
+        if self._scale != 1.0:
+            velocity, cov = velocity / self._scale, cov / self._scale**2
         if self._body_R_dvl is not None:
             velocity, cov = _turned(self._body_R_dvl, velocity), self._body_R_dvl @ cov @ self._body_R_dvl.T
         block, confirmation = (rows.stamps_ns, velocity, cov), self._confirmation

@@ -150,8 +150,8 @@ class SeenFrame:
         """Prediction from the newest keyframe, with its joint covariance with other variables."""
         keyframes, smoother = self.keyframes, self.keyframes.smoother
         motion = keyframes.motion_since_newest(self.stamp_ns)
-        pose_key, bias_key = keyframes.newest_key, keyframes.bias_key(-1)
-        joint = smoother.joint_covariance([pose_key, *([] if bias_key is None else [bias_key]), *keys])
+        pose_key, bias_key = keyframes.newest_key, keyframes.bias_keys[-1]
+        joint = smoother.joint_covariance([pose_key, bias_key, *keys])
         return PredictedView(pose_key, bias_key, smoother.values.atPose3(pose_key), motion, self._body_T_sonar, joint)
 
     def sightings(self, view: PredictedView, rows: list[int], points: Floats | None = None) -> list[Sighting]:

@@ -24,7 +24,9 @@ import numpy as np
 from sonar_graph.calibration import Calibration, PlanarMotion
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Floats
+from sonar_graph.motion import ACCEL, COMPASS
 from sonar_graph.navigation import PreintegratedMotion
+from sonar_graph.numerics import cross_matrix
 from sonar_graph.slam.models.kernels import Robust
 from sonar_graph.slam.models.sonar_model import wrap_angle
 from sonar_graph.slam.models.views import range_azimuth_jacobians
@@ -32,6 +34,11 @@ from sonar_graph.slam.models.views import range_azimuth_jacobians
 UNINFORMATIVE_M = 1e5
 UNINFORMATIVE_RAD = 1e3
 """Sigmas that leave a direction to the other factors."""
+EXACT, STEADY = 1e-9, 1e-3
+"""Sigma of a bias (rad/s, m/s²) that is zero; share of its sigma by which one without a walk may walk in a stretch."""
+HUBER_WIDTH = 1.345
+"""Of the kernel of headings and position fixes, in standard deviations: 95 % efficient for Gaussian noise. It is
+convex: a start that is far off finds its way, which a kernel that lets go of large errors does not promise."""
 CORRELATION_LIMIT = 1e-6
 """Above it, range and azimuth noise are taken together."""
 EQUIDISTANT = gtsam.Cal3Fisheye(1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -77,14 +84,16 @@ def start_prior(pose_key: int, calibration: Calibration) -> gtsam.NonlinearFacto
     return gtsam.PriorFactorPose3(pose_key, start.pose(), gaussian(cov))
 
 
-def bias_prior(bias_key: int, sigma: float) -> gtsam.NonlinearFactor:
-    """Gyro bias is N(0, sigma²) on each axis, rad/s."""
-    return gtsam.PriorFactorPoint3(bias_key, np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, sigma))
+def bias_prior(bias_key: int, sigmas: Floats) -> gtsam.NonlinearFactor:
+    """Biases are N(0, sigma²), one sigma each; where it is zero, `EXACT`."""
+    noise = gtsam.noiseModel.Diagonal.Sigmas(np.maximum(sigmas, EXACT), False)
+    return gtsam.PriorFactorVector(bias_key, np.zeros(len(sigmas)), noise)
 
 
-def bias_walk(key_i: int, key_j: int, sigma: float) -> gtsam.NonlinearFactor:
-    """Gyro bias of the next stretch is that of the last, give or take sigma on each axis, rad/s."""
-    return gtsam.BetweenFactorPoint3(key_i, key_j, np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, sigma))
+def bias_walk(key_i: int, key_j: int, sigmas: Floats) -> gtsam.NonlinearFactor:
+    """Biases of the next stretch are those of the last, give or take a sigma each."""
+    noise = gtsam.noiseModel.Diagonal.Sigmas(np.maximum(sigmas, STEADY * EXACT), False)
+    return gtsam.BetweenFactorVector(key_i, key_j, np.zeros(len(sigmas)), noise)
 
 
 def odometry(key_i: int, key_j: int, motion: PreintegratedMotion) -> gtsam.NonlinearFactor:
@@ -94,7 +103,7 @@ def odometry(key_i: int, key_j: int, motion: PreintegratedMotion) -> gtsam.Nonli
 
 
 def odometry_with_bias(key_i: int, key_j: int, bias_key: int, motion: PreintegratedMotion) -> gtsam.NonlinearFactor:
-    """Relative pose from preintegrated gyro and DVL, and its gyro bias.
+    """Relative pose from preintegrated gyro and DVL, and the biases b, of which ``D_bias`` has a column each.
 
     Error ``Log(corrected(b)^-1 X_i^-1 X_j)``, shape (6,), with ``corrected(b) = i_T_j Exp(D_bias (b - bias))``.
     """
@@ -102,7 +111,7 @@ def odometry_with_bias(key_i: int, key_j: int, bias_key: int, motion: Preintegra
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:
         X_i, X_j = values.atPose3(key_i), values.atPose3(key_j)
-        correction = motion.D_bias @ (values.atPoint3(bias_key) - motion.bias)
+        correction = motion.D_bias @ (values.atVector(bias_key) - motion.bias)
         E = gtsam.Pose3.Expmap(-correction).compose(inverse_mean).compose(X_i.between(X_j))
         e = gtsam.Pose3.Logmap(E)
         if jacobians is not None:
@@ -226,6 +235,57 @@ def gravity_direction(pose_key: int, up_in_body: Floats, sigma_rad: float) -> gt
     measured = up_in_body / np.linalg.norm(up_in_body)
     noise = gtsam.noiseModel.Isotropic.Sigma(3, sigma_rad)
     return gtsam.MagPoseFactorPose3(pose_key, measured, 1.0, UP, ORIGIN, noise)
+
+
+def gravity_with_bias(
+    pose_key: int, bias_key: int, up_in_body: Floats, by_accel: Floats, sigma_rad: float
+) -> gtsam.NonlinearFactor:
+    """As `gravity_direction`, where the accelerometers' bias tilts the direction: error ``R^T e_z + A b_accel - up``.
+
+    ``by_accel``: A, derivative of the unit vector measured by the bias, shape (3, 3), s²/m.
+    """
+    measured = up_in_body / np.linalg.norm(up_in_body)
+    across = by_accel - np.outer(measured, measured @ by_accel)
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:
+        up, b = values.atPose3(pose_key).rotation().matrix()[2], values.atVector(bias_key)
+        if jacobians is not None:
+            jacobians[0], jacobians[1] = np.hstack((cross_matrix(up), np.zeros((3, 3)))), np.zeros((3, len(b)))
+            jacobians[1][:, ACCEL] = across
+        return up + across @ b[ACCEL] - measured
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Isotropic.Sigma(3, sigma_rad), [pose_key, bias_key], error)
+
+
+def huber(noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
+    """Noise of headings and position fixes, of which some are outliers."""
+    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(HUBER_WIDTH), noise)
+
+
+def heading(
+    pose_key: int, bias_key: int, yaw_rad: float, sigma_rad: float, robust: Robust = huber
+) -> gtsam.NoiseModelFactor:
+    """Yaw of the body and the compass' bias add up to what is measured: ``atan2(R_yx, R_xx) + b_compass - yaw``."""
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:
+        R, b = values.atPose3(pose_key).rotation().matrix(), values.atVector(bias_key)
+        (x, a, c), (y, b_y, d) = R[0].tolist(), R[1].tolist()
+        if jacobians is not None:
+            level2 = x * x + y * y
+            jacobians[0], jacobians[1] = np.zeros((1, 6)), np.zeros((1, len(b)))
+            jacobians[0][0, 1:3] = (y * c - x * d) / level2, (x * b_y - y * a) / level2
+            jacobians[1][0, COMPASS] = 1.0
+        return np.array([wrap_angle(math.atan2(y, x) + b[COMPASS] - yaw_rad)])
+
+    noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma_rad)
+    return gtsam.CustomFactor(robust(noise), [pose_key, bias_key], error)
+
+
+def position(
+    pose_key: int, position_m: Floats, keyframe_p_antenna: Floats, cov_m2: Floats, robust: Robust = huber
+) -> gtsam.NoiseModelFactor:
+    """World position of a point, shape (3,) in the keyframe's body frame, as measured: ``p + R l - z``."""
+    return gtsam.GPSFactorArm(pose_key, position_m, keyframe_p_antenna, robust(gaussian(cov_m2)))
 
 
 def planar(pose_key: int, motion: PlanarMotion) -> dict[str, gtsam.NonlinearFactor]:

@@ -82,7 +82,7 @@ class PredictedView:
         self._by_state[:, self._pose_row : self._pose_row + 6] = keyframe_T_sonar.inverse().AdjointMap()
         if bias_key is not None:
             row = covariance.rows[bias_key]
-            self._by_state[:, row : row + 3] = self._by_body @ motion.D_bias
+            self._by_state[:, row : row + len(motion.bias)] = self._by_body @ motion.D_bias
 
     def height_variance(self, point: Floats) -> float:
         """Variance of the world z of a point fixed to the body at the frame, shape (3,) in the world, m².

@@ -17,6 +17,7 @@ import gtsam
 import numpy as np
 
 from sonar_graph.measurements import Floats
+from sonar_graph.motion import BIASES
 
 MAX_ITERATIONS = 50
 RELATIVE_DECREASE = 1e-7
@@ -181,7 +182,7 @@ class JointCovariance:
 
     @classmethod
     def of(cls, marginals: gtsam.Marginals | gtsam.ISAM2, keys: list[int]) -> JointCovariance:
-        """Ask for poses (6 rows each) and points (3 rows each)."""
+        """Ask for poses (6 rows each), biases (11) and points (3)."""
         rows, n = {}, 0
         for key in keys:
             rows[key] = n
@@ -222,5 +223,5 @@ class KeptCovariance:
 
 
 def tangent_size(key: int) -> int:
-    """Dimension of a variable: 6 of a pose, 3 of a point."""
-    return 6 if gtsam.symbolChr(key) == ord("x") else 3
+    """Dimension of a variable: 6 of a pose, 11 of the biases, 3 of a point."""
+    return {ord("x"): 6, ord("b"): BIASES}.get(gtsam.symbolChr(key), 3)

@@ -53,10 +53,10 @@ def with_marginals(
 
 
 def picked(values: gtsam.Values, keys: Iterable[int]) -> gtsam.Values:
-    """Some of the variables, poses and points. GTSAM copies all that it is given for each factor in Python."""
+    """Some of the variables, poses and vectors. GTSAM copies all that it is given for each factor in Python."""
     few = gtsam.Values()
     for key in keys:
-        few.insert(key, values.atPose3(key) if gtsam.symbolChr(key) == ord("x") else values.atPoint3(key))
+        few.insert(key, values.atPose3(key) if gtsam.symbolChr(key) == ord("x") else values.atVector(key))
     return few
 
 

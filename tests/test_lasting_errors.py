@@ -1,0 +1,209 @@
+"""Biases of a run: what they do to a motion, by differences of motions of rows that have them; what gravity tells."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from baselines.invariant_ekf import InvariantEkf
+from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting, Start
+from sonar_graph.measurements import Dvl, Heading, Imu, PositionFixes
+from sonar_graph.motion import BIASES, COMPASS, HEADING, SCALE, TILT, by_biases, gyro_bias_of
+from sonar_graph.navigation import Odometry
+from sonar_graph.sequence import Sequence
+from sonar_graph.slam import Isam2
+
+G, ARM = 9.80665, (-0.3, 0.2, 0.1)
+END_NS = 60_000_000_000
+
+
+def turning(
+    calibration: Calibration, roll_rad: float = 0.3, rate_rad_s: float = 0.3, accel_bias=(0.0, 0.0, 0.0), scale=0.0
+) -> Sequence:
+    """A minute of exact rows of a vehicle that circles about the vertical, rolled, at 0.5 m/s."""
+    imu_ns, dvl_ns = np.arange(0, END_NS + 1, 20_000_000), np.arange(0, END_NS + 1, 200_000_000)
+    up = Rotation.from_euler("x", roll_rad).inv().apply([0.0, 0.0, 1.0])
+    ahead, arm = np.array([0.5, 0.0, 0.0]), np.array(calibration.dvl.mounting.translation_m)
+    gyro, force = rate_rad_s * up, G * up + np.cross(rate_rad_s * up, ahead) + accel_bias
+    velocity = (ahead + np.cross(gyro, arm)) * (1.0 + scale)
+    unknown = np.full((len(dvl_ns), 3, 3), np.nan)
+    imu = Imu(imu_ns, np.tile(gyro, (len(imu_ns), 1)), np.tile(force, (len(imu_ns), 1)))
+    start = calibration.start.model_copy(update={"rpy_rad": (roll_rad, 0.0, 0.0)})
+    world = calibration.model_copy(update={"start": start})
+    return Sequence("circle", world, imu, Dvl(dvl_ns, np.tile(velocity, (len(dvl_ns), 1)), unknown))
+
+
+def known(**imu: float) -> Calibration:
+    return Calibration(
+        imu=ImuCalibration(**({"gyro_noise_density": 1e-4, "accel_noise_density": 1e-3} | imu)),
+        dvl=DvlCalibration(mounting=Mounting(translation_m=ARM)),
+    )
+
+
+def ran(kind: type, sequence: Sequence, rate_hz: float = 1.0):
+    estimator = kind(sequence.calibration, Odometry(sequence.calibration))
+    estimates = [estimator.process(step) for step in sequence.replay(sequence.instants(rate_hz))]
+    return estimator, [estimate for estimate in estimates if estimate is not None]
+
+
+def biases_of(estimator) -> tuple[np.ndarray, np.ndarray]:
+    """Newest b and its covariance."""
+    if isinstance(estimator, InvariantEkf):
+        _, state = estimator.state()
+        return state.bias, state.P[3 : 3 + BIASES, 3 : 3 + BIASES]
+    values, marginals = estimator._smoother.values, estimator._smoother.marginals
+    key = max(key for key in values.keys() if gtsam.Symbol(key).chr() == ord("b"))  # noqa: SIM118
+    return values.atVector(key), marginals.marginalCovariance(key)
+
+
+def motion_of(sequence: Sequence):
+    odometry = Odometry(sequence.calibration)
+    odometry.add(sequence.imu, sequence.dvl)
+    return odometry.motion(0, 4_000_000_000, np.zeros(3))
+
+
+def split(sequence: Sequence) -> np.ndarray:
+    motion = motion_of(sequence)
+    dR, dp = motion.i_T_j.rotation().matrix(), motion.i_T_j.translation()
+    up = sequence.calibration.start.pose().rotation().matrix()[2]
+    return by_biases(motion.D_bias, dR, dp, up, np.array(ARM))
+
+
+def test_both_gyro_biases_are_the_gyros_and_one_turns_about_the_vertical_alone():
+    sequence = turning(known())
+    D, motion = split(sequence), motion_of(sequence)
+    np.testing.assert_allclose(D[:, TILT] + D[:, HEADING], motion.D_bias, atol=1e-12)
+    up_j = (sequence.calibration.start.pose() * motion.i_T_j).rotation().matrix()[2]
+    np.testing.assert_allclose(np.cross(up_j, D[:3, HEADING].T), 0.0, atol=1e-12)
+    np.testing.assert_allclose(up_j @ D[:3, TILT], 0.0, atol=1e-12)
+    assert np.abs(D[:3, HEADING]).max() > 3.0
+    b = np.arange(11.0)
+    assert gyro_bias_of(b, np.array([0.0, 0.0, 1.0])) == pytest.approx([0.0, 1.0, 5.0])
+
+
+def test_the_scale_lengthens_the_way_of_the_doppler_log():
+    """By differences, with its lever arm; what is known of scale and gyro bias leaves the rows."""
+    exact, longer = motion_of(turning(known())), motion_of(turning(known(), scale=1e-4))
+    moved = gtsam.Pose3.Logmap(longer.i_T_j.between(exact.i_T_j)) / 1e-4
+    np.testing.assert_allclose(split(turning(known()))[:, SCALE], moved, atol=1e-3)
+    assert np.abs(moved[3:]).max() > 1.0
+    bias = np.array([0.01, -0.02, 0.03])
+    sequence = turning(known(), scale=0.05)
+    imu = sequence.calibration.imu.model_copy(update={"gyro_bias_rad_s": tuple(bias)})
+    dvl = sequence.calibration.dvl.model_copy(update={"scale_error": 0.05})
+    told = sequence.calibration.model_copy(update={"imu": imu, "dvl": dvl})
+    biased = replace(sequence.imu, angular_velocity=sequence.imu.angular_velocity + bias)
+    found = motion_of(replace(sequence, calibration=told, imu=biased))
+    assert found.i_T_j.equals(exact.i_T_j, 1e-9)
+    assert not motion_of(replace(sequence, imu=biased)).i_T_j.equals(exact.i_T_j, 1e-2)
+
+
+estimators = pytest.mark.parametrize("kind", [InvariantEkf, Isam2])
+
+
+@estimators
+def test_gravity_tells_the_tilt_and_nothing_of_the_heading(kind):
+    """Rolled by 17 degrees it would tell the gyro's bias about the vertical, if that were there once."""
+    with_it = known(gyro_bias_sigma=1e-2, gyro_bias_walk_density=0.0)
+    without = with_it.model_copy(update={"use_gravity": False})
+    both = [ran(kind, turning(calibration)) for calibration in (with_it, without)]
+    told, untold = (estimates[-1].covariance[:3, :3] for _, estimates in both)
+    up = both[0][1][-1].world_T_body.rotation().matrix()[2]
+    assert up @ told @ up == pytest.approx(up @ untold @ up, rel=1e-2)
+    assert np.trace(told) - up @ told @ up < 0.1 * (np.trace(untold) - up @ untold @ up)
+    turned = biases_of(both[0][0])[1][HEADING, HEADING]
+    np.testing.assert_allclose(turned, 1e-4 * np.eye(3), atol=1e-6)
+    assert biases_of(both[0][0])[1][TILT, TILT][0, 0] < 0.1 * 1e-4
+
+
+@estimators
+def test_turns_tell_the_accelerometers_bias_from_a_tilt(kind):
+    """The tilt stays in the world and the bias in the body; ``b_accel = 0`` leaves the vehicle askew."""
+    bias, exact = np.array([0.1, -0.05, 0.0]), {"gyro_noise_density": 1e-5, "gyro_bias_sigma": 0.0}
+    start = Start(rpy_sigma_rad=(0.02, 0.02, 1e-3))
+    found = {}
+    for sigma in (0.1, 1e-9):
+        calibration = known(accel_bias_sigma=sigma, accel_bias_walk_density=0.0, **exact)
+        sequence = turning(calibration.model_copy(update={"start": start}), 0.0, 0.2, bias)
+        estimator, estimates = ran(kind, sequence)
+        up = estimates[-1].world_T_body.rotation().matrix()[2]
+        found[sigma] = np.linalg.norm(up[:2])
+        if sigma == 0.1:
+            b, cov = biases_of(estimator)
+            assert b[6:8] == pytest.approx(bias[:2], abs=0.01)
+            assert cov[6, 6] < 0.01 * 0.1**2
+    assert found[0.1] < 1e-3
+    assert found[1e-9] > 2 * found[0.1]
+
+
+def headings(sequence: Sequence, off_rad: float, every: int = 10) -> Heading:
+    stamps_ns = sequence.imu.stamps_ns[::every]
+    return Heading(stamps_ns, 0.3 * stamps_ns * 1e-9 + off_rad, np.full(len(stamps_ns), 0.02))
+
+
+def circle_fixes(sequence: Sequence, at_ns: np.ndarray, antenna: np.ndarray) -> PositionFixes:
+    angle = 0.3 * at_ns * 1e-9
+    centre_out = 0.5 / 0.3 * np.column_stack([np.sin(angle), 1.0 - np.cos(angle), np.zeros(len(angle))])
+    arms = (Rotation.from_euler("z", angle[:, None]) * Rotation.from_euler("x", 0.3)).apply(antenna)
+    return PositionFixes(at_ns, centre_out + arms, np.tile(0.04 * np.eye(3), (len(at_ns), 1, 1)))
+
+
+def aided(**update) -> Sequence:
+    calibration = known(gyro_bias_sigma=1e-2).model_copy(update={"start": Start(rpy_sigma_rad=(0.3, 0.3, 0.5))})
+    sequence = turning(calibration)
+    start = sequence.calibration.start.model_copy(update={"rpy_rad": (0.3, 0.0, 0.4)})
+    return replace(sequence, calibration=sequence.calibration.model_copy(update={"start": start} | update))
+
+
+def yaw_error(estimate) -> float:
+    true = 0.3 * estimate.stamp_ns * 1e-9
+    return abs(float(np.angle(np.exp(1j * (estimate.world_T_body.rotation().yaw() - true)))))
+
+
+def test_a_heading_turns_the_smoother_right_and_outliers_do_not_turn_it_wrong():
+    """0.4 rad off at the start; a fifth of the samples half a turn off; the compass' bias leaves the rest unsure."""
+    sequence = aided()
+    plain = headings(sequence, 0.0)
+    wrong = replace(plain, yaw_rad=plain.yaw_rad + np.where(np.arange(len(plain)) % 5 == 2, np.pi, 0.0))
+    assert yaw_error(ran(Isam2, sequence)[1][-1]) > 0.3
+    for heading in (plain, wrong):
+        assert yaw_error(ran(Isam2, replace(sequence, heading=heading))[1][-1]) < 0.03
+    _, estimates = ran(Isam2, replace(sequence, heading=plain))
+    up = estimates[-1].world_T_body.rotation().matrix()[2]
+    assert up @ estimates[-1].covariance[:3, :3] @ up == pytest.approx(0.05**2, rel=0.1), "the bias of all samples"
+
+
+def test_position_fixes_give_place_and_heading_by_the_antenna_and_the_compass_its_bias():
+    antenna = np.array([0.5, -0.3, 1.0])
+    positions = aided().calibration.positions.model_copy(update={"antenna_m": tuple(antenna)})
+    sequence = aided(positions=positions)
+    fixes = circle_fixes(sequence, np.arange(500_000_000, END_NS, 1_030_000_000), antenna)
+    biased = replace(sequence, positions=fixes, heading=headings(sequence, 0.1))
+    estimator, estimates = ran(Isam2, biased)
+    assert yaw_error(estimates[-1]) < 0.05
+    assert biases_of(estimator)[0][COMPASS] == pytest.approx(0.1, abs=0.05)
+    true = circle_fixes(sequence, np.array([END_NS]), np.zeros(3)).position_m[0]
+    assert np.linalg.norm(estimates[-1].world_T_body.translation() - true) < 0.15
+    unaware = replace(biased, calibration=aided().calibration, heading=None)
+    off = ran(Isam2, unaware)[1][-1].world_T_body.translation() - true
+    assert np.linalg.norm(off) > 0.5, "without the lever arm"
+
+
+def test_a_late_fix_counts_while_its_keyframe_is_in_the_window_and_is_named_when_not():
+    """One exact fix, 7 s late, is as good as in time; 24 s late it is refused."""
+    sequence = aided()
+    fix = circle_fixes(sequence, np.array([35_000_000_000]), np.zeros(3))
+    fix = replace(fix, covariance_m2=1e-6 * np.eye(3)[None])
+    ends = {}
+    for late_ns in (0, 7_000_000_000, 24_000_000_000):
+        estimator = Isam2(sequence.calibration, Odometry(sequence.calibration))
+        for step in sequence.replay(sequence.instants(1.0)):
+            is_now = step.end_ns == 35_000_000_000 + late_ns
+            estimate = estimator.process(replace(step, positions=fix) if is_now else step)
+        ends[late_ns] = estimate.world_T_body.translation()
+        late = [row for row in estimator.refused_rows() if row.sensor == "positions"]
+        assert [row.stamp_ns for row in late] == ([35_000_000_000] if late_ns == 24_000_000_000 else [])
+    assert ends[7_000_000_000] == pytest.approx(ends[0], abs=0.1)
+    assert np.linalg.norm(ends[24_000_000_000] - ends[0]) > 0.2
