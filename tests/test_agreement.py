@@ -78,6 +78,15 @@ def test_filter_and_smoother_are_least_squares_where_all_is_linear(params):
         assert found.covariances[:, 0, 0] == pytest.approx([variance["l4"], variance["l7"]], abs=1e-6)
 
 
+@pytest.mark.parametrize("params", [EkfSlamParams(), InvariantEkfParams()], ids=["ekf-slam", "invariant-ekf"])
+def test_filters_judge_detections_as_the_smoother_does_by_default(params):
+    smoother = Isam2Params()
+    assert params.kernel == smoother.kernel
+    assert params.minimum_id_probability == smoother.identity.minimum_probability
+    assert params.gate_probability == 1.0
+    assert np.isinf(smoother.identity.gate)
+
+
 @smoothers
 def test_filter_and_smoother_agree_where_all_is_linear(params):
     """Between nodes too, and in all that is known of the pose."""

@@ -247,9 +247,9 @@ def test_what_no_vehicle_in_reach_sees_is_refused(filter_):
     assert e @ np.linalg.solve(S, e) > gate_threshold(0.999, 2)
 
 
-def far(cov, G_z, range_m, noise, missed=(0.0, 0.0, 0.0), aperture_rad=APERTURE_RAD):
+def far(cov, G_z, range_m, noise, missed=(0.0, 0.0, 0.0), aperture_rad=APERTURE_RAD, kernel=GaussianKernel()):  # noqa: B008
     """`far_view` of a detection with this covariance of range and azimuth; None where it is linear enough."""
-    sonar = SonarModel.of(AHEAD, FilterParams(kernel=GaussianKernel()))._replace(aperture_rad=aperture_rad)
+    sonar = SonarModel.of(AHEAD, FilterParams(kernel=kernel))._replace(aperture_rad=aperture_rad)
     return far_view(np.array(missed), np.array(cov), G_z, sonar, np.array([range_m, 0.0]), np.array(noise))
 
 
@@ -263,6 +263,18 @@ def test_the_noise_of_a_view_holds_that_of_many_beams_and_without_aperture_is_th
     noise = np.array([[0.04, -0.003], [-0.003, 0.0009]])
     V = far(1e6 * np.eye(3), np.eye(3), 40.0, noise, aperture_rad=0.0)[1] - 1e6 * np.eye(3)
     assert_allclose(V, np.pad(noise, (0, 1)), atol=1e-9)
+
+
+def test_a_kernel_widens_the_noise_of_a_far_view_as_that_of_a_near_one():
+    G_z, noise, missed = np.diag([1.0, 10.0, 10.0]), np.diag([0.04, 0.0009]), (9.0, 7.0, 0.0)
+    cov = np.diag([1.0, 9.0, 1.0])
+    _, plain, e, S = far(cov, G_z, 10.0, noise, missed)
+    widened = admitted(e, S, noise, kernel=RobustKernel())[1]
+    assert widened[0, 0] > noise[0, 0]
+    _, wide, *same = far(cov, G_z, 10.0, noise, missed, kernel=RobustKernel())
+    assert_allclose(wide - plain, G_z[:, :2] @ widened @ G_z[:, :2].T, atol=1e-12)
+    for part, other in zip(same, (e, S), strict=True):
+        assert_array_equal(part, other)
 
 
 def test_linear_is_what_errs_by_less_than_the_noise():
