@@ -268,6 +268,8 @@ def test_heading_and_fixes_tell_the_rows_whose_noise_cannot_be():
     skew, indefinite, infinite, unknown = good.copy(), good.copy(), good.copy(), good.copy()
     skew[0, 1], infinite[2, 2], unknown[0, 0] = 1.8, np.inf, np.nan
     indefinite[0, 1] = indefinite[1, 0] = 2.1
-    covs = np.stack([good, 1e-9 * good, good.astype(np.float32), unknown, skew, indefinite, infinite, -good, 0 * good])
-    fixes = PositionFixes(np.arange(9), np.zeros((9, 3)), covs)
-    assert fixes.are_sound().tolist() == [True] * 4 + [False] * 5
+    cyclic = np.array([[1.0, 0.9, 0.9], [0.9, 1.0, -0.9], [0.9, -0.9, 1.0]])  # indefinite, though no pair of axes is
+    sound = [good, 1e-9 * good, good.astype(np.float32), unknown]
+    covs = np.stack([*sound, skew, indefinite, cyclic, infinite, -good, 0 * good])
+    fixes = PositionFixes(np.arange(10), np.zeros((10, 3)), covs)
+    assert fixes.are_sound().tolist() == [True] * 4 + [False] * 6

@@ -190,6 +190,26 @@ def check_request(name: str, overrides: dict[str, Any] | None = None) -> None:
     make_params(kind, overrides or {}, name)
 
 
+AIDING = ("heading", "positions")
+"""Blocks that an estimator may know nothing of."""
+
+
+class _Watched(Measurements):
+    """Measurements that remember which of `AIDING` they were asked for, so that what nobody uses is named."""
+
+    @classmethod
+    def of(cls, step: Measurements, asked: set[str]) -> "_Watched":
+        """The same measurements; ``asked`` grows by what is asked for."""
+        watched = object.__new__(cls)
+        vars(watched).update(vars(step), asked=asked)
+        return watched
+
+    def __getattribute__(self, name: str) -> Any:
+        if name in AIDING:
+            vars(self)["asked"].add(name)
+        return super().__getattribute__(name)
+
+
 class _Replay:
     """A run in progress: estimates and maps until now, and the duration of each call."""
 
@@ -205,6 +225,7 @@ class _Replay:
         ends_ns = np.array([step.end_ns for step in steps], dtype=np.int64)
         interim_ns = kept_map_instants(ends_ns, sequence.start_ns).tolist()[:-1]
         self._map_at_ns = set(interim_ns if interim_maps else [])
+        self._asked: set[str] = set()
         self._maps: list[MapSoFar] = []
         self._stage = "at the start"
 
@@ -250,11 +271,12 @@ class _Replay:
     def _process(self, estimator: Estimator, progress: Callable[[int, int], None] | None) -> None:
         from sonar_graph.numerics import compiling_s  # loads numba, which an estimator needs and a result does not
 
+        is_aided = any(name in self._sequence.blocks() for name in AIDING)
         for done, step in enumerate(self._steps, start=1):
-            end_ns = step.end_ns
+            end_ns, given = step.end_ns, _Watched.of(step, self._asked) if is_aided else step
             self._stage = f"{(end_ns - self._sequence.start_ns) * 1e-9:.3f} s after the start ({end_ns} ns)"
             before = time.perf_counter() - compiling_s()
-            estimate = estimator.process(step)
+            estimate = estimator.process(given)
             self._update_s.append(time.perf_counter() - compiling_s() - before)
             if estimate is not None and estimate.stamp_ns != end_ns:
                 raise EvaluationError(
@@ -286,11 +308,20 @@ class _Replay:
             landmarks=landmarks,
             detections=detections,
             refused=self._refused(estimator),
-            withheld=withheld_of(estimator),
+            withheld=[*withheld_of(estimator), *self._ignored()],
             maps=self._maps,
             finish_s=finish_s,
             peak_memory_mb=peak_memory_mb,
         )
+
+    def _ignored(self) -> list[str]:
+        """Messages about blocks that the estimator never asked for."""
+        blocks = self._sequence.blocks()
+        return [
+            f"{name}: none of its {len(blocks[name])} rows is used; this estimator takes no {name}"
+            for name in AIDING
+            if name in blocks and name not in self._asked
+        ]
 
     def _refused(self, estimator: Estimator) -> list[RefusedRow]:
         """Rows that the replay left out, and those that the estimator names."""

@@ -1,11 +1,12 @@
-"""The page, the tables and the files of a comparison whose truth has positions only."""
+"""Comparisons whose truth has positions only, and of estimators that take no headings or fixes."""
 
 import json
 from dataclasses import replace
 
 import numpy as np
 
-from sonar_graph.evaluation import compare, write_comparison, write_viewer_files
+from baselines.dead_reckoning import DeadReckoning
+from sonar_graph.evaluation import compare, run_estimator, write_comparison, write_viewer_files
 from sonar_graph.report import write_report
 from sonar_graph.report.console import summary
 from sonar_graph.states import Trajectory
@@ -34,3 +35,18 @@ def test_nothing_about_a_true_heading_is_written(tmp_path):
     assert {(q.x, q.y, q.z, q.w) for q in poses} == {(0.0, 0.0, 0.0, 1.0)}
     assert not any(t.child_frame_id.startswith("ground_truth") for m in topics["/tf"] for t in m.transforms)
     assert np.isnan(comparison.sequence.truth.quaternions_xyzw).all()
+
+
+def test_headings_and_fixes_that_an_estimator_never_asks_for_are_named(monkeypatch):
+    world = aided_world()
+    unaided = replace(world, heading=None, positions=None)
+    process = DeadReckoning.process
+
+    def looking(self, measurements):
+        assert measurements.heading is None or len(measurements.heading)
+        return process(self, measurements)
+
+    monkeypatch.setattr(DeadReckoning, "process", looking)
+    fixes = "positions: none of its 21 rows is used; this estimator takes no positions"
+    assert run_estimator(world, "dead-reckoning").withheld == [fixes]
+    assert run_estimator(unaided, "dead-reckoning").withheld == []
