@@ -52,7 +52,7 @@ class Fault:
 
 
 FAULTS: list[Fault] = []
-VEHICLES, ALL = ("mission", "akit"), ("mission", "akit", "mrclam")
+SEA, VEHICLES, ALL = ("mission",), ("mission", "akit"), ("mission", "akit", "mrclam")
 
 
 def fault(sensor: str, named: str, bases: tuple[str, ...] = VEHICLES) -> Callable[[Change], Change]:
@@ -338,8 +338,7 @@ def dvl_one_velocity_of_1e9(rows: SimpleNamespace, _: Generator) -> Effect:
 @fault("dvl", "dvl.*no vehicle")
 def dvl_5_percent_at_5_m_s(rows: SimpleNamespace, rng: Generator) -> Effect:
     chosen = some(rows, rng, 0.05)
-    rows.velocity[chosen] = 5.0
-    return Effect(chosen)
+    return moved_by(rows, lambda: rows.velocity.__setitem__(chosen, 5.0))
 
 
 @fault("dvl", "dvl.*no vehicle")
@@ -358,8 +357,8 @@ def dvl_invalid_marked_by_minus_32768(rows: SimpleNamespace, rng: Generator) -> 
 
 @fault("dvl", "dvl.*no vehicle")
 def dvl_first_three_rows_wrong(rows: SimpleNamespace, _: Generator) -> Effect:
-    rows.velocity[:3] = [[5.0, 0, 0], [-3.0, 4.0, 0.0], [0.0, -6.0, 2.0]]
-    return Effect(np.arange(len(rows.stamps_ns)) < 3)
+    wrong = np.array([[5.0, 0.0, 0.0], [-3.0, 4.0, 0.0], [0.0, -6.0, 2.0]])
+    return moved_by(rows, lambda: rows.velocity.__setitem__(slice(3), wrong))
 
 
 @fault("dvl", "dvl.*same to the last bit")
@@ -413,20 +412,20 @@ def dvl_10_percent_indefinite_covariances(rows: SimpleNamespace, rng: Generator)
     return Effect(chosen)
 
 
-@fault("dvl", "dvl.*covariance")
+@fault("dvl", "dvl.*covariance", SEA)
 def dvl_10_percent_negative_variances(rows: SimpleNamespace, rng: Generator) -> Effect:
     chosen = some(rows, rng, 0.1)
     rows.velocity_cov[chosen] = -1e-2 * np.eye(3)
     return Effect(chosen)
 
 
-@fault("dvl", "dvl.*no covariance")
+@fault("dvl", "dvl.*no covariance", SEA)
 def dvl_10_percent_zero_covariances(rows: SimpleNamespace, rng: Generator) -> Effect:
     rows.velocity_cov[some(rows, rng, 0.1)] = 0.0
     return Effect()
 
 
-@fault("dvl", "dvl.*covariance")
+@fault("dvl", "dvl.*covariance", SEA)
 def dvl_one_covariance_infinite(rows: SimpleNamespace, _: Generator) -> Effect:
     rows.velocity_cov[one(rows)] = np.inf
     return Effect(one(rows))
@@ -511,9 +510,6 @@ def dvl_clock_half_a_second_late(rows: SimpleNamespace, _: Generator) -> Effect:
 
 
 # ------------------------------------------------------------------------------------------------------- depth
-SEA = ("mission",)
-
-
 @fault("depth", "depth.*no vehicle reaches", SEA)
 def depth_5_percent_at_1000_m(rows: SimpleNamespace, rng: Generator) -> Effect:
     chosen = some(rows, rng, 0.05)

@@ -64,6 +64,8 @@ SENSORS = ("imu", "dvl", "depth", "detections")
 FACTOR, ROUNDING_M = 1.25, 0.05
 SLOW, SLOW_S, HUNG_S = 5.0, 5.0, 60.0
 DURATION_S = 90.0
+EPOCH_NS = 1_400_000_000 * NS
+SOUND_LANDMARKS = LandmarkOptions(spacing_m=10.0, wrong_id_rate=0.0, false_detections_per_frame=0.0)
 QUICK = 12
 """Every so many of the cases."""
 
@@ -80,8 +82,11 @@ def log_of(data: Path, base: str) -> Sequence:
         whole = read(where, 1)
     ends = whole.start_ns - NS, whole.start_ns + round(DURATION_S * NS)
     blocks: dict[str, Any] = {name: block.between(*ends) for name in SENSORS if (block := getattr(whole, name))}
+    blocks["truth"] = whole.truth
+    if base == "akit":  # whose stamps begin at 0, which in a log means that there is none
+        blocks = {name: replace(block, stamps_ns=block.stamps_ns + EPOCH_NS) for name, block in blocks.items()}
     short = replace(whole, **blocks)
-    return add_landmarks(short, LandmarkOptions(spacing_m=10.0)) if base == "akit" else short
+    return add_landmarks(short, SOUND_LANDMARKS) if base == "akit" else short
 
 
 @dataclass
