@@ -71,6 +71,13 @@ def test_too_few_samples_for_a_line_leave_a_walk():
     assert not motion(imu, dvl, known, ways.LOST_S, ways.OPEN_S).i_T_j.equals(walked.i_T_j, 0.1)
 
 
+def walk(known, imu_rows, dvl_rows, start_s, until_s):
+    """Motion within a gap without accelerometers."""
+    odometry = Odometry(known)
+    odometry.add(ways.blinded(imu_rows), dvl_rows.between(0, at(Vehicle.LOST_S)))
+    return odometry.motion(at(start_s), at(until_s), np.zeros(3)).i_T_j
+
+
 def test_a_gap_that_stays_open_is_a_walk_once_accelerometers_are_less_sure_than_that():
     """Both variances of the limit's equation are equal there; the end of the gap brings the accelerometers back."""
     cheap = ImuCalibration(gyro_noise_density=3e-3, accel_noise_density=1e-2, accel_bias_sigma=0.05)
@@ -83,6 +90,12 @@ def test_a_gap_that_stays_open_is_a_walk_once_accelerometers_are_less_sure_than_
         found, walked = (motion(rows, dvl_rows, known, lost_s, until_s) for rows in (imu_rows, ways.blinded(imu_rows)))
         assert found.i_T_j.equals(walked.i_T_j, 0.0) == is_walk
         assert np.array_equal(found.covariance, walked.covariance) == is_walk
+    odometry, early = Odometry(known), lost_s + T - 1.0
+    odometry.add(imu_rows, dvl_rows.between(0, at(lost_s)))
+    first, rest = (odometry.motion(at(lost_s), at(until_s), np.zeros(3)) for until_s in (early, lost_s + T + 0.1))
+    after = odometry.motion(at(early), at(lost_s + T + 0.1), np.zeros(3))  # both parts of one walk
+    assert after.i_T_j.equals(walk(known, imu_rows, dvl_rows, early, lost_s + T + 0.1), 1e-9)
+    assert not first.i_T_j.compose(after.i_T_j).equals(rest.i_T_j, 1e-3)
     exact = ImuCalibration(gyro_noise_density=0.0, accel_noise_density=0.0, accel_bias_sigma=0.0)
     assert longest_open_s(Calibration(imu=exact)) == np.inf
 
