@@ -250,7 +250,7 @@ def test_the_normalised_error_of_an_aligned_map_has_the_freedom_that_alignment_l
                 return replace(exact, positions=exact.positions + noise)
 
         found.append(landmark_scores(Noisy(sequence.calibration).landmarks(), sequence)["landmarks.nees"].value)
-    assert np.mean(found) == pytest.approx(1.0, abs=0.2)
+    assert np.mean(found) == pytest.approx(1.0, abs=0.1)
 
 
 class Moving(Offset):

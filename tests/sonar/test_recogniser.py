@@ -260,6 +260,17 @@ def test_a_track_is_reported_as_often_as_its_errors_are_independent_and_when_its
     assert recogniser_said(model)[module.NOT_INDEPENDENT] == len(named[False]) - len(reports)
 
 
+def test_a_new_identity_is_reported_at_once(monkeypatch: pytest.MonkeyPatch):
+    model = confusion_for(DEFAULT_DESIGNS).model_copy(update={"error_correlation": 0.9})  # one frame in nineteen
+    recogniser, frames = Recogniser(DECIBELS, params=RecogniserParams(confusion=model)), iter(range(15))
+    believed = np.eye(5)[[SQUARE] * 8 + [DISC] * 7]
+    monkeypatch.setattr(
+        recogniser._beliefs, "step", lambda association, *_: believed[[next(frames)] * len(association)]
+    )
+    found = pass_by(recogniser, SQUARE, frames=15, step_m=0.02)
+    assert [k for k, one in enumerate(found) if one is not None] == [2, 8]
+
+
 def recogniser_said(model) -> Counter:
     recogniser, said = Recogniser(DECIBELS, params=RecogniserParams(confusion=model)), Counter()
     for k in range(15):
