@@ -84,7 +84,7 @@ def second(entry: str) -> str:
         (log("grid = { wrong_id_rate = [0.1, 0.1] }\n"), "grid", "has 0.1 more than once"),
         (basin("[[logs]]", "[logs]"), "[logs]", "expected a list of tables, [[logs]]"),
         (basin('"basin"\ngen', '"all logs"\ngen'), "all logs", "stands for all logs"),
-        (end("params = { lag = 3 }\n"), "lag = 3", "it has: none"),
+        (end("params = { lag = 3 }\n"), "lag = 3", "it has: gravity_interval_s"),
         (head("metrics = []\n"), "metrics", "metrics"),
         (head('metrics = ["causal.ate_se3"]\n'), "metrics", "did you mean causal.ate_se3_m?"),
         (other('log = "no.mcap"\n'), "no.mcap", "no.mcap is not in"),

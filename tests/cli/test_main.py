@@ -65,7 +65,7 @@ def test_examples_in_help_are_understood(tmp_path, monkeypatch):
     files = "dive.mcap vehicle.toml dive.toml dive.bag dive.ddf dive.aris pings.raw reference.json suite.toml"
     for name in files.split():
         Path(name).touch()
-    for name in ("comparison", "MRCLAM_Dataset6", "DLR", "A-KIT", "ros2_bag_folder", "results"):
+    for name in ("comparison", "MRCLAM_Dataset6", "DLR", "A-KIT", "StPereDataset", "ros2_bag_folder", "results"):
         Path(name).mkdir()
     for path, command in commands().items():
         examples = [line.split() for line in command.epilog.splitlines() if line.startswith("sonar-graph ")]
@@ -98,6 +98,6 @@ def test_help_names_defaults_presets_and_roles_as_they_are():
 def test_every_command_that_writes_from_a_file_is_tried_in_the_tests_of_outputs():
     """A command that joins later must not be forgotten."""
     writing = {path[-1] for path, c in commands().items() if any(option.name == "output" for option in c.params)}
-    of_folders, of_nothing = {"mrclam", "dlr", "akit"}, {"basin", "demo"}
+    of_folders, of_nothing = {"mrclam", "dlr", "akit", "stpere"}, {"basin", "demo"}
     tried = {"rosbag", "didson", "aris", "oculus", "victoria-park", "compare", "recognise", "landmarks", "calibrate"}
     assert writing == tried | of_folders | of_nothing | {"run"}
