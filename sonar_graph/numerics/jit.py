@@ -3,7 +3,8 @@
 import hashlib
 import sys
 from collections import Counter
-from functools import cache
+from collections.abc import Callable
+from functools import cache, partial
 from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any, TypeVar, cast
@@ -26,8 +27,18 @@ def compiled(function: Compiled, *, forceinline: bool = False) -> Compiled:
     made = numba.njit(cache=True, error_model="numpy", forceinline=forceinline)(function)
     if isinstance(made, Dispatcher):  # a plain function with NUMBA_DISABLE_JIT
         # numba's own stamp is of the function's file alone, and in its older versions of the file's time
-        cast(Any, made)._cache._cache_file._source_stamp = _digest(function.__globals__)
+        cached = cast(Any, made)._cache._cache_file
+        cached._source_stamp = _digest(function.__globals__)
+        cached._load_index = partial(_readable, cached._load_index)
     return cast(Compiled, made)
+
+
+def _readable(load_index: Callable[[], dict[Any, str]]) -> dict[Any, str]:
+    """Index of cached code; empty where it names a class that another version of the package had."""
+    try:
+        return load_index()
+    except (AttributeError, ImportError):
+        return {}
 
 
 def inlined(function: Compiled) -> Compiled:
