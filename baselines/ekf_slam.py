@@ -26,7 +26,7 @@ from baselines.filter import (
     add_force,
     remove_rate,
     up_at_end,
-)
+)  # fmt: skip
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats
@@ -133,17 +133,9 @@ class EkfSlam(FilterShell):
             When the pitch comes so near 90 degrees that the Euler angles are singular.
         """
         k = advance(
-            self._x,
-            self._P,
-            self.turned,
-            self.impulse,
-            self.earth,
-            self.port,
-            self.depth_variance,
-            *self.sonar[:3],
-            events,
-            k,
-        )
+            self._x, self._P, self.turned, self.impulse, self.earth, self.port, self.depth_variance, *self.sonar[:3],
+            events, k,
+        )  # fmt: skip
         if math.cos(self._x[4]) < SINGULAR_COSINE:
             raise EstimatorError(
                 f"ekf-slam: pitch is {math.degrees(self._x[4]):.2f} deg at {events.start_ns[k]} ns, where the Euler"
