@@ -35,7 +35,7 @@ def sound_detections(frame: LandmarkDetections) -> Flags:
     """Rows that a sonar can have measured, shape (n,)."""
     a, b, c, d = frame.range_azimuth_cov.reshape(-1, 4).T
     with np.errstate(all="ignore"):
-        is_definite = (a > 0) & (a * d - b * c > ROUNDING * a * d)
+        is_definite = (a > 0) & (a * d - (0.5 * (b + c)) ** 2 > ROUNDING * a * d)
     return possible_ranges(frame.range_m) & (is_definite | np.isnan(frame.range_azimuth_cov).any(axis=(1, 2)))
 
 

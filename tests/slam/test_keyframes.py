@@ -426,6 +426,9 @@ def test_sound_detections_have_covariances_whose_eigenvalues_are_above_zero():
         np.diag([1.0, -np.inf]),
         [[1.0, np.inf], [np.inf, 1.0]],
         [[0.0, 0.0], [0.0, 1.0]],
+        [[1.0, 10.0], [-10.0, -1.0]],
+        [[1.0, 0.0], [10.0, 1.0]],
+        [[1e-4, 0.0101], [0.0101, 1.0]],
     ]
     covs = np.concatenate([covs, unusable, np.full((1, 2, 2), np.nan)])
     n = len(covs)
