@@ -26,7 +26,7 @@ from baselines.filter import (
     add_force,
     remove_rate,
     up_at_end,
-)  # fmt: skip
+)
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats
@@ -116,7 +116,7 @@ class EkfSlam(FilterShell):
         super().__init__(calibration, odometry, params or EkfSlamParams())
         start = calibration.start
         self._x, self._P = np.array([*start.position_m, *start.pose().rotation().rpy()]), np.zeros((POSE, POSE))
-        E = np.linalg.inv(np.array(ekf_equations.after(self._x, np.eye(3), np.zeros(3))[2].b))
+        E = np.linalg.inv(np.array(ekf_equations.after(self._x, np.eye(3), np.zeros(3))[2].b))  # W^-1
         self._P[:3, :3] = np.diag(np.square(start.position_sigma_m))
         self._P[3:, 3:] = E @ np.diag(np.square(start.rpy_sigma_rad)) @ E.T
 

@@ -430,14 +430,14 @@ def test_sound_detections_have_covariances_whose_eigenvalues_are_above_zero():
         [[1.0, 0.0], [10.0, 1.0]],
         [[1e-4, 0.0101], [0.0101, 1.0]],
     ]
-    covs = np.concatenate([covs, unusable, np.full((1, 2, 2), np.nan)])
+    covs = np.concatenate([covs, unusable, [np.diag([1.0, 1e-14])], np.full((1, 2, 2), np.nan)])
     n = len(covs)
     frame = LandmarkDetections(
         np.zeros(n, np.int64), np.ones(n), np.zeros(n), covs, np.zeros((n, 1), np.int64), np.ones((n, 1))
     )
     expected = np.linalg.eigvalsh(covs[:2000])[:, 0] > 0
     assert 200 < expected.sum() < 1800
-    assert np.array_equal(sound_detections(frame), [*expected, *[False] * len(unusable), True])
+    assert np.array_equal(sound_detections(frame), [*expected, *[False] * len(unusable), True, True])
 
 
 @given(st.lists(st.tuples(st.floats(1e-9, 1e-2), st.floats(1e-5, 1e-2)), min_size=1, max_size=12))
