@@ -114,7 +114,7 @@ class EkfSlam(FilterShell):
         super().__init__(calibration, odometry, params or EkfSlamParams())
         start = calibration.start
         self._x, self._P = np.array([*start.position_m, *start.pose().rotation().rpy()]), np.zeros((POSE, POSE))
-        E = np.linalg.inv(np.array(ekf_equations.after(self._x, np.eye(3), np.zeros(3))[2].b))
+        E = np.linalg.inv(np.array(ekf_equations.after(self._x, np.eye(3), np.zeros(3))[2].b))  # W^-1
         self._P[:3, :3] = np.diag(np.square(start.position_sigma_m))
         self._P[3:, 3:] = E @ np.diag(np.square(start.rpy_sigma_rad)) @ E.T
 

@@ -524,8 +524,7 @@ class FilterShell(ABC):
 
     def _start(self, end_ns: int) -> None:
         """Set the state's epoch to the first one, if it is reached."""
-        start_ns = self.odometry.start_by(end_ns)
-        if start_ns is None:
+        if (start_ns := self.odometry.start_by(end_ns)) is None:
             return
         self._reached_ns = self.odometry.reached_ns(start_ns)
         self.node_ns = self._opened_ns = self._kept_ns = start_ns
@@ -545,7 +544,8 @@ class FilterShell(ABC):
             outcome[stamps_ns < self._reached_ns] = OUTCOME_NUMBERS[Outcome.UNLOCATED]
         landmark = np.array([-1 if self._was_lost else self._slots.get(i, -1) for i in ids.tolist()])
         z, R_z = read(detections.range_m, detections.azimuth_rad, detections.range_azimuth_cov, self.sonar.R_z)
-        e, S = np.full((n, 2), math.nan), np.full((n, 2, 2), math.nan)
+        e, S = np.empty((n, 2)), np.empty((n, 2, 2))
+        e[:] = S[:] = math.nan
         return ids, Views(stamps_ns, landmark, z, R_z, outcome, e, S)
 
     def _use(self, end_ns: int, depth: Depth | None, since_ns: int, ids: Ints, views: Views) -> Estimate:

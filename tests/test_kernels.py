@@ -50,13 +50,14 @@ def test_the_first_compilation_is_told_once_and_later_ones_are_not(loops):
     assert told(loops, "import loops; assert loops.thrice(1.5) == 4.5") == ""  # compiled, but not the first time
 
 
-def test_a_class_that_a_new_version_has_no_more_is_no_mistake_of_the_cache(loops):
-    program = "from typing import NamedTuple\nfrom sonar_graph.numerics import compiled\n"
-    program += "class Pair(NamedTuple):\n    a: int\n"
-    program += "@compiled\ndef first(pair):\n    return pair.a\n"
-    for name in ("Pair", "Couple"):
-        (loops / "loops.py").write_text(program.replace("Pair", name))
+def test_a_class_or_module_that_a_new_version_has_no_more_is_no_mistake_of_the_cache(loops):
+    head, pair = "from typing import NamedTuple\n", "class {}(NamedTuple):\n    a: int\n"
+    loop = "from sonar_graph.numerics import compiled\n@compiled\ndef first(pair):\n    return pair.a\n"
+    (loops / "pairs.py").write_text(head + pair.format("Pair"))
+    for name, of_pairs in (("Pair", "from pairs import Pair\n\n"), *((n, pair.format(n)) for n in ("Couple", "Two"))):
+        (loops / "loops.py").write_text(head + of_pairs + loop)
         told(loops, f"import loops; assert loops.first(loops.{name}(2)) == 2")
+        (loops / "pairs.py").unlink(missing_ok=True)
 
 
 def test_a_long_wait_is_told_with_what_is_compiled_and_how_far_it_is(loops):

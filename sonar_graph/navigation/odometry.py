@@ -137,7 +137,9 @@ class Odometry:
 
     def epochs(self, after_ns: int, until_ns: int) -> Ints:
         """Epochs after one instant that are reached at another, in order, shape (n,)."""
-        return self.epochs_reached(after_ns, until_ns)[0]
+        dvl_ns = self._dvl.stamps_ns
+        first, last = _epochs_between(after_ns, until_ns, self._imu.stamps_ns, dvl_ns, self._dvl.values[2])
+        return dvl_ns[first:last]
 
     def epochs_reached(self, after_ns: int, until_ns: int) -> tuple[Ints, Ints]:
         """`epochs` and their `reached_ns`, shapes (n,)."""
@@ -263,12 +265,19 @@ def _joined(before: PreintegratedMotion | None, motion: PreintegratedMotion) -> 
 
 
 @compiled
-def _epochs_reached(after_ns: int, until_ns: int, imu_ns: Ints, dvl_ns: Ints, known_ns: Ints) -> tuple[int, int, Ints]:
-    """First and last row (exclusive) of `Odometry.epochs`, and when these are reached."""
+def _epochs_between(after_ns: int, until_ns: int, imu_ns: Ints, dvl_ns: Ints, known_ns: Ints) -> tuple[int, int]:
+    """First and last row (exclusive) of `Odometry.epochs`."""
     seen, first, last = rows_until(imu_ns, until_ns), rows_until(dvl_ns, after_ns), 0
     if seen > 0:
         last = min(rows_until(known_ns, until_ns), rows_until(dvl_ns, imu_ns[seen - 1]))
-    reached_ns = np.empty(max(last - first, 0), np.int64)
+    return first, max(first, last)
+
+
+@compiled
+def _epochs_reached(after_ns: int, until_ns: int, imu_ns: Ints, dvl_ns: Ints, known_ns: Ints) -> tuple[int, int, Ints]:
+    """First and last row (exclusive) of `Odometry.epochs`, and when these are reached."""
+    first, last = _epochs_between(after_ns, until_ns, imu_ns, dvl_ns, known_ns)
+    reached_ns = np.empty(last - first, np.int64)
     for k in range(len(reached_ns)):
         reached_ns[k] = max(imu_ns[rows_until(imu_ns, dvl_ns[first + k] - 1)], known_ns[first + k])
     return first, last, reached_ns

@@ -21,7 +21,11 @@ samples of 5 mm/s at 7 Hz, short enough for an accelerometer's bias not to have 
 class StampedRows:
     """Rows of one sensor in the order of their stamps, each stamp once, with columns of values, given empty."""
 
+    stamps_ns: Ints
+    values: tuple[NDArray[Any], ...]
+
     def __init__(self, *values: NDArray[Any]) -> None:
+        self._columns: list[NDArray[Any]] = []
         self._show(0, np.empty(0, np.int64), *values)
 
     def insert(self, stamps_ns: Ints, *values: NDArray[Any]) -> bool:
@@ -36,9 +40,11 @@ class StampedRows:
             columns = [np.empty((4 * end, *old.shape[1:]), old.dtype) for old in columns]
             for column, old in zip(columns, self._columns, strict=True):
                 column[:n] = old[:n]
+        shown: list[NDArray[Any]] = []
         for column, new in zip(columns, (stamps_ns, *values), strict=True):
             column[n:end] = new
-        self._show(end, *columns)
+            shown.append(column[:end])
+        self._columns, self.stamps_ns, self.values = columns, shown[0], tuple(shown[1:])
         if not comes_after:
             kept = np.unique(self.stamps_ns, return_index=True)[1]
             self._show(len(kept), *(column[kept] for column in columns))
@@ -52,7 +58,7 @@ class StampedRows:
     def _show(self, n: int, *columns: NDArray[Any]) -> None:
         """Take columns, of which the first n rows are filled."""
         self._columns = list(columns)
-        self.stamps_ns: Ints = columns[0][:n]
+        self.stamps_ns = columns[0][:n]
         self.values = tuple([column[:n] for column in columns[1:]])
 
 

@@ -209,8 +209,9 @@ def floor_lift(ranges_m: Floats, cos_a: Floats, sin_a: Floats, up: Floats, heigh
     ``cos e = (A k +- B w) / (A^2 + B^2)``, ``sin e = (B k -+ A w) / (A^2 + B^2)``; the larger cosine is nearer to the
     centre beam.
     """
-    across, lift, k = up[0] * cos_a + up[1] * sin_a, up[2], -height_m / ranges_m
+    across, lift = up[0] * cos_a + up[1] * sin_a, up[2]
     norm2 = across * across + lift * lift
-    with np.errstate(invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):
+        k = -height_m / ranges_m
         w = math.copysign(1.0, lift) * np.sqrt(norm2 - k * k)
     return (across * k + lift * w) / norm2, (lift * k - across * w) / norm2

@@ -118,7 +118,7 @@ def floor_cells(
         ratio = (up[1] * cos_a - up[0] * sin_a) * cos_e / (up[2] * cos_e - sin_e * (up[0] * cos_a + up[1] * sin_a))
         area = r * r * np.sqrt((cos_e * cos_e + ratio * ratio) / (r * r - height_m * height_m))
     x, y, _ = level_R_sonar @ np.stack([cos_e * cos_a, cos_e * sin_a, sin_e])
-    is_met = area > 0
+    is_met = (area > 0) & (r > height_m)
     return np.where(is_met, r * x, 0.0), np.where(is_met, r * y, 0.0), np.where(is_met, area, 0.0)
 
 
@@ -137,7 +137,7 @@ def pixel_sums(
     region, r = labels.ravel()[at] - 1, ranges_m[bin_]
     cos_a, sin_a = np.cos(azimuths_rad)[beam], np.sin(azimuths_rad)[beam]
     x, y, area = floor_cells(r, cos_a, sin_a, level_R_sonar, height_m) if height_m > 0 else (r * cos_a, r * sin_a, r)
-    dr, da = (abs(places[-1] - places[0]) / (len(places) - 1) for places in (ranges_m, azimuths_rad))
+    dr, da = (abs(places[-1] - places[0]) / max(len(places) - 1, 1) for places in (ranges_m, azimuths_rad))
     area, level = area * (dr * da), contrast_db.ravel()[at]
     moments = area, level, (ax := area * x), (ay := area * y), ax * x, ax * y, ay * y, None
     return np.stack([np.bincount(region, weights, count) for weights in moments], axis=1)

@@ -287,6 +287,7 @@ def test_a_row_that_comes_after_later_ones_is_an_epoch_from_the_instant_on_at_wh
     odometry.add(None, rows.rows(slice(missing, missing + 1)))
     epochs_ns, reached_ns = odometry.epochs_reached(0, T0_NS + 10 * NS)
     assert np.array_equal(epochs_ns, rows.stamps_ns)
+    assert [part.tolist() for part in odometry.epochs_reached(T0_NS + 10 * NS, T0_NS)] == [[], []]
     assert reached_ns.tolist() == [odometry.reached_ns(epoch_ns) for epoch_ns in epochs_ns.tolist()]
     for until_ns in np.unique(reached_ns).tolist():
         for instant_ns in (until_ns - 1, until_ns):

@@ -172,6 +172,18 @@ def test_beyond_the_limit_the_strongest_are_kept():
     assert one.verdicts[left] == CandidateVerdict.BEYOND_LIMIT
 
 
+@pytest.mark.parametrize("pitch", np.arange(0.0, 1.2, 0.02))
+def test_of_a_region_those_pixels_count_whose_rays_meet_the_floor(pitch):
+    """One bin is exactly as far as the floor is deep."""
+    view, ranges, contrast = FloorView.from_angles(2.0, 0.0, pitch), np.linspace(1.0, 3.0, 201), np.zeros((95, 201))
+    azimuths, labels = np.linspace(0.25, -0.25, 95), np.ones((95, 201), dtype=np.int32)
+    whole = measure_regions(contrast.astype(np.float32), labels, 1, ranges, azimuths, view)
+    labels[:, ranges <= 2.0] = 0
+    beyond = measure_regions(contrast.astype(np.float32), labels, 1, ranges, azimuths, view)
+    for found in ("points_m", "area_m2", "extent_m"):
+        assert getattr(whole, found) == pytest.approx(getattr(beyond, found), rel=1e-9)
+
+
 def test_what_lies_nearer_than_the_floor_is_off_it():
     image = speckle_db(6)
     image[40:56, 20:60] += 15
