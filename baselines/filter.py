@@ -30,7 +30,7 @@ from sonar_graph.motion import Motions, MotionSource, require_source
 from sonar_graph.navigation.alignment import earth_rate_in_world, tilt_sigma, up_direction
 from sonar_graph.numerics import I3, LOWER_LEFT, ZERO, compiled, cross, exp_and_mean, mat, store, vec
 from sonar_graph.slam.landmarks import ACCEPTED, MINIMUM_PROBABILITY, gate_threshold, identify
-from sonar_graph.slam.models import KernelParams, RobustKernel, elevation_on_floor
+from sonar_graph.slam.models import elevation_on_floor
 from sonar_graph.states import (
     OUTCOME_NUMBERS,
     CausalEstimates,
@@ -45,12 +45,13 @@ from sonar_graph.states import (
 
 
 class FilterParams(Section):
-    """Settings of both filters; the paper gives none of them."""
+    """Settings of both filters; the paper gives none of them, and neither gate nor kernel."""
 
     gate_probability: float = Field(1.0, gt=0, le=1)
     """Probability with which a right detection passes the gate (chi-square); 1: no gate, as published."""
-    kernel: KernelParams = RobustKernel()
-    """Shape of the noise of range and of azimuth, by which outliers pull less; the smoother's default too."""
+    kernel_width: float = Field(0.0, ge=0)
+    """Width in standard deviations of a Cauchy kernel by which outlying ranges and azimuths pull less, that of
+    `sonar_graph.slam.RobustKernel`; 0: no kernel, as published."""
     minimum_id_probability: float = Field(MINIMUM_PROBABILITY, ge=0, le=1)
     """Least posterior of the most probable identity with which a detection is used; the smoother's default too."""
     gravity_interval_s: float = Field(1.0, gt=0)
@@ -239,7 +240,6 @@ class Gate(NamedTuple):
     """Squared Mahalanobis distance beyond which an innovation is refused."""
     width: float
     """Of the kernel, in standard deviations; infinite: none."""
-    is_huber: bool
     outlying: NDArray[np.bool_]
     """Which of the last detections were outliers, as a ring."""
     judged: Ints
@@ -248,11 +248,8 @@ class Gate(NamedTuple):
     @classmethod
     def of(cls, params: FilterParams) -> "Gate":
         """The gate and kernel of a filter's settings, with nothing judged yet."""
-        kernel, threshold = params.kernel, gate_threshold(params.gate_probability, 2)
-        width, is_huber = (
-            (kernel.width, kernel.shape == "huber") if isinstance(kernel, RobustKernel) else (math.inf, False)
-        )
-        return cls(threshold, width, is_huber, np.zeros(JUDGED_TOGETHER, np.bool_), np.zeros(1, np.int64))
+        threshold, width = gate_threshold(params.gate_probability, 2), params.kernel_width or math.inf
+        return cls(threshold, width, np.zeros(JUDGED_TOGETHER, np.bool_), np.zeros(1, np.int64))
 
 
 @compiled
@@ -273,8 +270,7 @@ def admit(e: Floats, S: Floats, R_z: Floats, gate: Gate) -> tuple[int, Floats]:
         return GATED, widened
     spread = np.empty(2)
     for i in range(2):
-        share = abs(e[i]) / (math.sqrt(S[i, i]) * gate.width)
-        spread[i] = math.sqrt(max(1.0, share) if gate.is_huber else 1.0 + share**2)
+        spread[i] = math.sqrt(1.0 + e[i] ** 2 / (S[i, i] * gate.width**2))
     for i in range(2):
         for j in range(2):
             widened[i, j] = (spread[i] * spread[j] - 1.0) * R_z[i, j]

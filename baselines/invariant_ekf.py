@@ -6,6 +6,7 @@ Equations: `baselines.invariant_equations`; docs/theory/invariant_ekf.md.
 from typing import ClassVar
 
 import numpy as np
+from pydantic import Field
 
 from baselines import invariant_equations as equations
 from baselines.filter import (
@@ -31,7 +32,10 @@ from sonar_graph.slam.models import FLOOR_GATE, wrap_angle
 
 
 class InvariantEkfParams(FilterParams):
-    """Settings of the invariant filter: the same as those of EKF-SLAM, with the same defaults."""
+    """Settings of the invariant filter: those of EKF-SLAM, with the smoother's kernel."""
+
+    kernel_width: float = Field(1.5, ge=0)
+    """As `FilterParams.kernel_width`; the smoother's default."""
 
 
 class InvariantEkf(FilterShell):

@@ -14,7 +14,7 @@ from sonar_graph.estimator import Estimator
 from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
-from sonar_graph.slam import GaussianKernel, Isam2, Isam2Params, KeyframeParams, SmootherParams
+from sonar_graph.slam import GaussianKernel, Isam2, Isam2Params, KeyframeParams, RobustKernel, SmootherParams
 from sonar_graph.states import Estimate
 
 from .slam.rail import STEP_S, T0_NS, rail
@@ -55,8 +55,8 @@ def made(kind: type[Estimator], calibration: Calibration, params: Any = None) ->
 def filters(calibration: Calibration) -> list[Estimator]:
     """Both filters, with Gaussian noise."""
     return [
-        made(EkfSlam, calibration, EkfSlamParams(kernel=GaussianKernel())),
-        made(InvariantEkf, calibration, InvariantEkfParams(kernel=GaussianKernel())),
+        made(EkfSlam, calibration, EkfSlamParams()),
+        made(InvariantEkf, calibration, InvariantEkfParams(kernel_width=0.0)),
     ]
 
 
@@ -78,10 +78,13 @@ def test_filter_and_smoother_are_least_squares_where_all_is_linear(params):
         assert found.covariances[:, 0, 0] == pytest.approx([variance["l4"], variance["l7"]], abs=1e-6)
 
 
-@pytest.mark.parametrize("params", [EkfSlamParams(), InvariantEkfParams()], ids=["ekf-slam", "invariant-ekf"])
-def test_filters_judge_detections_as_the_smoother_does_by_default(params):
+@pytest.mark.parametrize(
+    ("params", "kernel_width"), [(EkfSlamParams(), 0.0), (InvariantEkfParams(), 1.5)], ids=["ekf-slam", "invariant-ekf"]
+)
+def test_filters_judge_detections_as_the_smoother_does_by_default_and_ekf_slam_as_published(params, kernel_width):
     smoother = Isam2Params()
-    assert params.kernel == smoother.kernel
+    assert smoother.kernel == RobustKernel(shape="cauchy", width=1.5)
+    assert params.kernel_width == kernel_width
     assert params.minimum_id_probability == smoother.identity.minimum_probability
     assert params.gate_probability == 1.0
     assert np.isinf(smoother.identity.gate)

@@ -33,13 +33,12 @@ import time
 import filterpy_ekf
 import numpy as np
 
-from baselines.ekf_slam import EkfSlam, EkfSlamParams
+from baselines.ekf_slam import EkfSlam
 from baselines.invariant_ekf import InvariantEkf
 from sonar_graph.measurements import NS_PER_S, Floats, Measurements
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
-from sonar_graph.slam.models import GaussianKernel
 
 FULL_S, QUICK_S = 2040.0, 120.0
 FILTERPY_S, FILTERPY_QUICK_S = 120.0, 30.0
@@ -100,7 +99,7 @@ def compare_filterpy(sequence: Sequence, windows: list[Measurements], part_s: fl
     part = [window for window in windows if window.end_ns <= until_ns]
     ours_s, sample_s, node_s, in_filterpy_s = [], [], [], []
     for _ in range(ROUNDS):
-        ours = EkfSlam(sequence.calibration, Odometry(sequence.calibration), EkfSlamParams(kernel=GaussianKernel()))
+        ours = EkfSlam(sequence.calibration, Odometry(sequence.calibration))
         ours_s.append(timed_run(ours, part).sum())
         seconds, by_sample = timed_filterpy(sequence, part[-1].end_ns, predicts_by_node=False)
         sample_s.append(seconds)

@@ -2,9 +2,8 @@
 
 Each estimator runs with its defaults, and with one choice at a time made otherwise:
 
-* gate: 0.999 instead of none (iSAM2: ``identity.policy = "gate"``); and the gate without the kernel, as many filters
-  have it;
-* kernel: none instead of the one that all have by default;
+* gate: 0.999 instead of none (iSAM2: ``identity.policy = "gate"``);
+* kernel: EKF-SLAM with the one that the others have by default, the others without; and each of these with the gate;
 * bias: EKF-SLAM, which has none in its state, with the drift of one in Q: over `BIAS_IN_Q_S` seconds T a constant
   bias turns as much as white noise of density ``sigma_b sqrt(T)``, which is added to the gyros'. The others without the
   bias that they have;
@@ -43,23 +42,29 @@ GYRO_BIASES = (0.0, 5e-5, 2e-4, 1e-3)
 """Sigmas, rad/s, as calibrated and as drawn."""
 ROBOTS = {6: (1, 2, 3, 4, 5), 9: (1, 2)}
 SCORES = ("causal.ate_se2_m", "smoothed.ate_se2_m", "landmarks.se2_m")
-NO_KERNEL, GATE = {"kernel": {"shape": "none"}}, {"gate_probability": 0.999}
-FILTER = {
-    "default": {},
-    "gate": GATE,
-    "no kernel": NO_KERNEL,
-    "gate without kernel": GATE | NO_KERNEL,
-    "bias": {},
-    "identity": {"minimum_id_probability": 0.0},
-}
+GATE, GATE_ISAM2 = {"gate_probability": 0.999}, {"identity": {"policy": "gate"}}
 VARIANTS: dict[str, dict[str, dict[str, Any]]] = {
-    "ekf-slam": FILTER,
-    "invariant-ekf": FILTER,
+    "ekf-slam": {
+        "default": {},
+        "gate": GATE,
+        "kernel": {"kernel_width": 1.5},
+        "gate and kernel": GATE | {"kernel_width": 1.5},
+        "bias": {},
+        "identity": {"minimum_id_probability": 0.0},
+    },
+    "invariant-ekf": {
+        "default": {},
+        "gate": GATE,
+        "no kernel": {"kernel_width": 0.0},
+        "gate, no kernel": GATE | {"kernel_width": 0.0},
+        "bias": {},
+        "identity": {"minimum_id_probability": 0.0},
+    },
     "isam2": {
         "default": {},
-        "gate": {"identity": {"policy": "gate"}},
-        "no kernel": NO_KERNEL,
-        "gate without kernel": {"identity": {"policy": "gate"}} | NO_KERNEL,
+        "gate": GATE_ISAM2,
+        "no kernel": {"kernel": {"shape": "none"}},
+        "gate, no kernel": GATE_ISAM2 | {"kernel": {"shape": "none"}},
         "bias": {},
         "identity": {"identity": {"minimum_probability": 0.0}},
         "no deferral": {"identity": {"longest_wait_s": 0.0}},

@@ -16,7 +16,6 @@ from baselines.invariant_equations import InvariantState
 from sonar_graph.calibration import Calibration, DepthCalibration, Mounting, SonarCalibration
 from sonar_graph.measurements import NS_PER_S, Floats
 from sonar_graph.navigation import Odometry
-from sonar_graph.slam.models import GaussianKernel, KernelParams
 
 SONAR = Mounting(translation_m=(0.4, 0.1, -0.2), rpy_rad=(0.1, 0.5, -0.2))
 PORT = np.array([0.1, 0.2, -0.3])
@@ -202,10 +201,11 @@ def begun(
     P: Floats | None = None,
     calibration: Calibration = CALIBRATION,
     gate: float = 0.999,
-    kernel: KernelParams = GaussianKernel(),  # noqa: B008
+    kernel_width: float = 0.0,
 ) -> FilterShell:
     """A filter with an estimate and a covariance, by default `random_covariance`."""
-    slam = filter_.kind(calibration, Odometry(calibration), filter_.kind.Params(gate_probability=gate, kernel=kernel))
+    params = filter_.kind.Params(gate_probability=gate, kernel_width=kernel_width)
+    slam = filter_.kind(calibration, Odometry(calibration), params)
     n = filter_.bare + world.landmarks.size
     filter_.begin(slam, world, random_covariance(n) if P is None else P)
     return slam
