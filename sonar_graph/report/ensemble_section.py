@@ -7,7 +7,7 @@ independent runs. Equations: docs/theory/metrics.md, docs/theory/batch_statistic
 import numpy as np
 from matplotlib.figure import Figure
 
-from sonar_graph.batch import Anees, anees, paired, summarise
+from sonar_graph.batch import Anees, anees, paired
 from sonar_graph.evaluation import Column, Ensemble, Table, absent, anees_interval, format_value, number, words
 from sonar_graph.measurements import Floats
 from sonar_graph.report import figure_style as style
@@ -58,11 +58,12 @@ def ensemble_sentences(ensembles: list[Ensemble]) -> list[str]:
 
 
 def ensemble_table(ensemble: Ensemble, name: str) -> Table:
-    """Mean errors with intervals, and ANEES at the last instant with its band, by estimator."""
+    """Mean errors with intervals, and ANEES at the last instant beside its 95 % band, by estimator."""
     columns = [Column("estimator", "Estimator", is_number=False)]
     columns += [Column(key, heading, "Mean of the runs (95 %), m") for key, heading in SHOWN.items()]
-    columns.append(Column("median", "Median (10 to 90 %), m", "Causal"))
-    columns += [Column(f"anees_{what}", what.capitalize(), "ANEES at the end") for what in DOF]
+    for what, dof in DOF.items():
+        low, high = anees_interval(len(ensemble.seeds), dof)
+        columns.append(Column(f"anees_{what}", f"{what.capitalize()} ({low:.2f} to {high:.2f})", "ANEES at the end"))
     rows = []
     for index, (estimator, scores) in enumerate(ensemble.values.items()):
         cells = [words(estimator, run=index)]
@@ -70,13 +71,9 @@ def ensemble_table(ensemble: Ensemble, name: str) -> Table:
             values = ensemble.of(estimator, key)
             known = any(value is not None for value in scores[key])
             cells.append(number(float(values.mean()), mean_text(values)) if known else absent())
-        told = summarise(ensemble.of(estimator, HEADLINE))
-        spread = f"{format_value(told.median)} ({format_value(told.low)} to {format_value(told.high)})"
-        cells.append(number(told.median, spread))
         for what, dof in DOF.items():
             found = anees_at_end(ensemble, estimator, what, dof)
-            note = found.verdict and f"{found.verdict}; expected {found.band[0]:.2f} to {found.band[1]:.2f}"
-            cells.append(number(found.mean, format_value(found.mean), note=note))
+            cells.append(number(found.mean, format_value(found.mean), note=found.verdict))
         rows.append(cells)
     title = f"{len(ensemble.seeds)} runs {ensemble.condition}"
     return Table(
