@@ -70,7 +70,8 @@ def ensemble_table(ensemble: Ensemble, name: str) -> Table:
         for key in SHOWN:
             values = ensemble.of(estimator, key)
             known = any(value is not None for value in scores[key])
-            cells.append(number(float(values.mean()), mean_text(values)) if known else absent())
+            mean, _, interval = mean_text(values).partition(" (")
+            cells.append(number(float(values.mean()), mean, note=interval.removesuffix(")")) if known else absent())
         for what, dof in DOF.items():
             found = anees_at_end(ensemble, estimator, what, dof)
             cells.append(number(found.mean, format_value(found.mean), note=found.verdict))
