@@ -79,7 +79,7 @@ def on_the_rail(
 
 def ranged(k: int, i: int, distance: float, elevation_sigma: float | None = None) -> Factors:
     """Factors of a range on the rail."""
-    z, R = np.array([distance, 0.0]), np.diag([RANGE_SIGMA_M**2, 1e6])
+    z, R = np.array([distance, 0.0]), np.diag([RANGE_SIGMA_M**2, 1e-2])
     return factors.landmark_sighting(X(k), L(i), gtsam.Pose3(), z, R, plain, elevation_sigma)
 
 

@@ -49,11 +49,17 @@ def smoother_with(
     stale_shift_m: float = 1e9,
     waiting_gain: float = 0.0,
     *,
+    submap_keyframes: int = 1,
     is_bounded: bool = False,
 ) -> Smoother:
-    """One that keeps all poses, never restarts and lets nothing wait, unless told so."""
+    """One that keeps all poses, never restarts and lets nothing wait, unless told so; its submaps are small."""
     params = SmootherParams(
-        lag_s=lag_s, relinearize_threshold=relinearize_threshold, stale_shift_m=stale_shift_m, waiting_gain=waiting_gain
+        lag_s=lag_s,
+        relinearize_threshold=relinearize_threshold,
+        relinearize_every=1,
+        submap_keyframes=submap_keyframes,
+        stale_shift_m=stale_shift_m,
+        waiting_gain=waiting_gain,
     )
     return Smoother(params, PoseHistory() if is_bounded else None)
 

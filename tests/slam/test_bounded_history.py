@@ -32,13 +32,14 @@ def run(sequence: Sequence, history: str, rate_hz: float = 2.0, **params) -> tup
     return ran(sequence, rate_hz, history__policy=history, **{"smoother__lag_s": LAG_S, **params})
 
 
-def test_causal_estimates_are_those_of_the_whole_history_to_the_bit():
-    """The window is the same; what is kept beside it is not asked."""
-    (_, whole), (_, bounded) = (run(mission(), of, smoother__stale_shift_m=1e9) for of in ("whole", "bounded"))
+def test_causal_estimates_are_those_of_the_whole_history_to_a_fifth_of_their_sigmas():
+    """They differ by what is linearised anew of a whole history alone."""
+    (_, whole), (_, bounded) = (run(mission(), of) for of in ("whole", "bounded"))
     assert len(whole) == len(bounded) > 200
     for one, other in zip(whole, bounded, strict=True):
-        assert np.array_equal(one.world_T_body.matrix(), other.world_T_body.matrix())
-        assert np.array_equal(one.covariance, other.covariance)
+        sigmas = np.sqrt(np.diag(one.covariance))
+        assert (np.abs(one.world_T_body.localCoordinates(other.world_T_body)) < 0.2 * sigmas).all()
+        assert np.diag(other.covariance) == pytest.approx(np.diag(one.covariance), rel=0.05)
 
 
 def test_poses_that_left_are_those_of_least_squares_as_far_as_the_lag_reached():

@@ -57,6 +57,8 @@ def ran(lag_s: float, history: str = "whole", kernel: str = "none") -> Isam2:
     return run(
         simulate_mission(MissionOptions(duration_s=40.0, imu="mti1", landmarks=6)),
         smoother__lag_s=lag_s,
+        smoother__submap_keyframes=3,
+        smoother__relinearize_every=1,
         history__policy=history,
         kernel__shape=kernel,
         smoother__waiting_gain=0.0,
@@ -86,7 +88,7 @@ def test_over_the_history_it_is_the_inverse_of_the_whole_information():
 def test_over_the_window_it_is_the_same_where_variables_are_linearised_if_nothing_was_marginalised():
     estimator = ran(1e9)
     found = estimator.joint_covariance(KEYFRAMES, (), LANDMARKS)
-    linearised = estimator._smoother._window.isam.getLinearizationPoint()
+    linearised = estimator._smoother._window.linearised_at
     assert off_sigmas(found.matrix, dense(estimator, linearised, KEYS)) < 1e-6
     assert 1e-4 < off_sigmas(found.matrix, dense(estimator, estimator.values, KEYS)) < 0.02
 

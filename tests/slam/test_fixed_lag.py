@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 from sonar_graph.slam.smoother import Sightline, fixed_lag
 from sonar_graph.slam.smoother.factor_store import FactorGroup, FactorStore
-from sonar_graph.slam.smoother.fixed_lag import SmootherWindow, marginal, picked
+from sonar_graph.slam.smoother.fixed_lag import FixedLagWindow, marginal
 
 from .graphs import factors_of
-from .made import graph_of, isotropic, point_prior, pose_prior, smoother_with, values_of
+from .made import graph_of, isotropic, point_prior, pose_prior, values_of
 
 PRIOR_M, TIGHT_M, WEAK_M = 3.0, 2e-8, 1e3
 CHAIN_M2 = PRIOR_M**2 + TIGHT_M**2 + WEAK_M**2
@@ -56,9 +56,10 @@ def test_what_lies_outside_counts_once_where_cholesky_gives_up(outside, variance
     _, solved = chain()
     solved.insert(L(3), ORIGIN)
     inside = graph_of([point_prior(L(2), ORIGIN, WEAK_M), near(2, 3, tight_m)])
-    window = SmootherWindow(1e-6, 1e9)
+    window = FixedLagWindow(1e-6, 1e9)
     window.is_by_qr = is_by_qr
-    window.begin(inside, picked(solved, [L(2), L(3)]), {L(2): 0.0, L(3): 0.0}, (outside, solved))
+    inside.push_back(outside)
+    window.begin(inside, solved, {L(2): 0.0, L(3): 0.0}, 0.0)
     expected = 1.0 / (1.0 / WEAK_M**2 + 1.0 / variance_m2)
     assert window.is_by_qr
     assert window.isam.marginalCovariance(L(2)) == pytest.approx(expected * np.eye(3), rel=1e-6)
@@ -66,19 +67,19 @@ def test_what_lies_outside_counts_once_where_cholesky_gives_up(outside, variance
 
 @pytest.mark.parametrize("is_by_qr", [False, True])
 def test_a_marginal_holds_where_it_was_made_though_the_window_is_linearised_elsewhere(is_by_qr: bool):
-    """One says 0 m and one 3 m, equally surely."""
-    outside, inside = (graph_of([point_prior(L(2), np.full(3, at_m), 1.0)]) for at_m in (0.0, 3.0))
-    values = values_of(L2=ORIGIN)
-    window = SmootherWindow(1e-6, 1e9)
+    """One says 0 m, from a point that has left, and one 3 m, equally surely."""
+    graph = graph_of([point_prior(L(1), ORIGIN, 0.6), near(1, 2, 0.8), point_prior(L(2), np.full(3, 3.0), 1.0)])
+    window = FixedLagWindow(1e-6, 1e9)
     window.is_by_qr = is_by_qr
-    window.begin(inside, values, {L(2): 0.0}, (outside, values))
+    window.begin(graph, values_of(L1=ORIGIN, L2=ORIGIN), {L(2): 0.0}, 0.0)
     window.settle()
-    assert window.isam.getLinearizationPoint().atPoint3(L(2)) == pytest.approx(np.full(3, 1.5), abs=1e-5)
-    assert window.isam.calculateEstimate().atPoint3(L(2)) == pytest.approx(np.full(3, 1.5))
+    assert not window.holds(L(1))
+    assert window.linearised_at.atPoint3(L(2)) == pytest.approx(np.full(3, 1.5), abs=1e-5)
+    assert window.estimate().atPoint3(L(2)) == pytest.approx(np.full(3, 1.5))
 
 
 def test_where_cholesky_gives_up_on_the_marginal_qr_makes_it(monkeypatch: pytest.MonkeyPatch):
-    """Three keyframes like the chain; a factor on the first, which has left, is exchanged for its like."""
+    """Three keyframes like the chain, of which one is left."""
     ways = []
 
     def giving_up(*arguments, is_by_qr: bool):
@@ -88,18 +89,12 @@ def test_where_cholesky_gives_up_on_the_marginal_qr_makes_it(monkeypatch: pytest
         return marginal(*arguments, is_by_qr=True)
 
     monkeypatch.setattr(fixed_lag, "marginal", giving_up)
-    smoother, handles = smoother_with(lag_s=0.5), []
-    for k, sigma in enumerate([PRIOR_M, 0.1, WEAK_M]):
-        smoother.add_pose(X(k), gtsam.Pose3(), float(k))
-        handles.append(smoother.add({"chain": factor(k, sigma)}))
-        if k:
-            smoother.update(float(k))
-    smoother.exchange(2.0, handles[:1], [FactorGroup({"prior": factor(0, PRIOR_M)})])
+    window, sigmas = FixedLagWindow(1e-3, 0.5), [PRIOR_M, 0.1, WEAK_M]
+    graph = graph_of([factor(k, sigma) for k, sigma in enumerate(sigmas)])
+    values = values_of(X0=gtsam.Pose3(), X1=gtsam.Pose3(), X2=gtsam.Pose3())
+    window.begin(graph, values, {X(k): float(k) for k in range(3)}, 2.0)
     assert ways == [False, True]
-    assert smoother.marginals.marginalCovariance(X(2)) == pytest.approx(
-        (PRIOR_M**2 + 0.1**2 + WEAK_M**2) * np.eye(6), rel=1e-6
-    )
-    assert not smoother.withheld
+    assert window.marginals.marginalCovariance(X(2)) == pytest.approx(np.square(sigmas).sum() * np.eye(6), rel=1e-6)
 
 
 @given(choices=st.lists(st.integers(0, 30), max_size=60))

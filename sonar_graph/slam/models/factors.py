@@ -108,18 +108,26 @@ def odometry_with_bias(key_i: int, key_j: int, bias_key: int, motion: Preintegra
     Error ``Log(corrected(b)^-1 X_i^-1 X_j)``, shape (6,), with ``corrected(b) = i_T_j Exp(D_bias (b - bias))``.
     """
     inverse_mean = motion.i_T_j.inverse()
+    known: tuple[bytes, gtsam.Pose3, Floats] | None = None  # biases are linearised anew far more seldom than poses
+
+    def corrected(bias: Floats) -> tuple[gtsam.Pose3, Floats]:
+        nonlocal known
+        if known is None or known[0] != bias.tobytes():
+            correction = motion.D_bias @ (bias - motion.bias)
+            inverse = gtsam.Pose3.Expmap(-correction).compose(inverse_mean)
+            known = bias.tobytes(), inverse, gtsam.Pose3.ExpmapDerivative(correction) @ motion.D_bias
+        return known[1:]
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:
-        X_i, X_j = values.atPose3(key_i), values.atPose3(key_j)
-        correction = motion.D_bias @ (values.atVector(bias_key) - motion.bias)
-        E = gtsam.Pose3.Expmap(-correction).compose(inverse_mean).compose(X_i.between(X_j))
+        i_T_j = values.atPose3(key_i).between(values.atPose3(key_j))
+        inverse_corrected, D_correction = corrected(values.atVector(bias_key))
+        E = inverse_corrected.compose(i_T_j)
         e = gtsam.Pose3.Logmap(E)
         if jacobians is not None:
             D_log = gtsam.Pose3.LogmapDerivative(e)
-            jacobians[0] = -D_log @ X_j.between(X_i).AdjointMap()
+            jacobians[0] = -D_log.dot(i_T_j.inverse().AdjointMap())
             jacobians[1] = D_log
-            D_exp = gtsam.Pose3.ExpmapDerivative(correction)
-            jacobians[2] = -D_log @ E.inverse().AdjointMap() @ D_exp @ motion.D_bias
+            jacobians[2] = -D_log.dot(E.inverse().AdjointMap()).dot(D_correction)
         return e
 
     return gtsam.CustomFactor(gaussian(motion.covariance), [key_i, key_j, bias_key], error)

@@ -5,11 +5,13 @@ sigma given its neighbours, which millimetre odometry reaches after some metres 
 once Cholesky has given up the window stays with QR (docs/theory/isam2.md).
 """
 
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from typing import Any
 
 import gtsam
 import numpy as np
+
+from sonar_graph.slam.smoother.batch_solution import picked
 
 
 def split(
@@ -52,19 +54,31 @@ def with_marginals(
     return graph
 
 
-def picked(values: gtsam.Values, keys: Iterable[int]) -> gtsam.Values:
-    """Some of the variables, poses and vectors. GTSAM copies all that it is given for each factor in Python."""
-    few = gtsam.Values()
-    for key in keys:
-        few.insert(key, values.atPose3(key) if gtsam.symbolChr(key) == ord("x") else values.atVector(key))
-    return few
-
-
 MOST_SETTLING_UPDATES = 10
 """Further updates after an exchange, each a Gauss-Newton step: what is exchanged may move the estimate far."""
 
 
-class SmootherWindow:
+def isam2_params(relinearize_threshold: float, *, is_by_qr: bool) -> gtsam.ISAM2Params:
+    """Settings of iSAM2 that relinearises at each update."""
+    params = gtsam.ISAM2Params()
+    params.setFactorization("QR" if is_by_qr else "CHOLESKY")
+    params.relinearizeSkip = 1
+    params.setRelinearizeThreshold(relinearize_threshold)
+    params.findUnusedFactorSlots = True
+    return params
+
+
+def settle(
+    update: Callable[[], object], isam: gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother, threshold: float
+) -> None:
+    """Update until nothing would be relinearised any more."""
+    for _ in range(MOST_SETTLING_UPDATES):
+        if isam.getDelta().norm() <= threshold:
+            break
+        update()
+
+
+class FixedLagWindow:
     """iSAM2 over the variables of the last ``lag_s`` seconds, by Cholesky, and by QR once that has given up."""
 
     def __init__(self, relinearize_threshold: float, lag_s: float) -> None:
@@ -75,57 +89,75 @@ class SmootherWindow:
         self.isam = self._empty()
 
     def _empty(self) -> gtsam.IncrementalFixedLagSmoother:
-        params = gtsam.ISAM2Params()
-        params.setFactorization("QR" if self.is_by_qr else "CHOLESKY")
-        params.relinearizeSkip = 1
-        params.setRelinearizeThreshold(self._threshold)
-        params.findUnusedFactorSlots = True
+        params = isam2_params(self._threshold, is_by_qr=self.is_by_qr)
         return gtsam.IncrementalFixedLagSmoother(self.lag_s, params)
 
     def begin(
-        self,
-        inside: gtsam.NonlinearFactorGraph,
-        values: gtsam.Values,
-        times_s: Mapping[Any, float],
-        outside: tuple[gtsam.NonlinearFactorGraph, gtsam.Values] | None = None,
+        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, times_s: Mapping[Any, float], time_s: float
     ) -> None:
-        """Begin anew with nothing but these factors and variables, by Cholesky, else by QR.
+        """Begin anew at a time with the variables not older than the lag, by Cholesky, else by QR.
 
-        With factors outside, and values of their variables, their marginal counts too. QR makes it anew, since by
-        Cholesky it may also have lost what is weak without a word. A RuntimeError where even QR finds no solution.
+        Of factors that touch others their marginal counts. QR makes it anew, since by Cholesky it may also have lost
+        what is weak without a word. A RuntimeError where even QR finds no solution.
         """
+        kept_s: dict[Any, float] = {key: t for key, t in times_s.items() if t >= time_s - self.lag_s}
+        inside, outside = split(graph, set(kept_s))
         try:
-            graph = gtsam.NonlinearFactorGraph(inside)
-            for factor in marginal(*outside, times_s, is_by_qr=self.is_by_qr) if outside else ():
-                graph.add(factor)
+            for factor in marginal(outside, values, kept_s, is_by_qr=self.is_by_qr) if outside.size() else ():
+                inside.add(factor)
             self.isam = self._empty()
-            self.isam.update(graph, values, times_s)
+            self.isam.update(inside, picked(values, kept_s), kept_s)
         except RuntimeError:
             if self.is_by_qr:
                 raise
             self.is_by_qr = True
-            self.begin(inside, values, times_s, outside)
+            self.begin(graph, values, times_s, time_s)
 
     def update(
         self,
         graph: gtsam.NonlinearFactorGraph,
         values: gtsam.Values,
         times_s: Mapping[Any, float],
-        removed_slots: Sequence[int],
+        _time_s: float,
+        removed: Sequence[gtsam.NonlinearFactor] = (),
     ) -> gtsam.Values:
-        """Estimate with new factors and variables, without what is in some places."""
+        """Estimate with new factors and variables, without some of the factors, which must be in the window."""
         self.isam.setSmootherLag(self.lag_s)
-        self.isam.update(graph, values, times_s, list(removed_slots))
+        self.isam.update(graph, values, times_s, self._slots(removed) or [])
+        return self.estimate()
+
+    @property
+    def marginals(self) -> gtsam.ISAM2:
+        """Source of covariances."""
+        return self.isam.getISAM2()
+
+    @property
+    def factors(self) -> gtsam.NonlinearFactorGraph:
+        """Factors, marginals among them; some places may be empty."""
+        return self.isam.getFactors()
+
+    @property
+    def linearised_at(self) -> gtsam.Values:
+        """Where the variables are linearised."""
+        return self.isam.getLinearizationPoint()
+
+    def estimate(self) -> gtsam.Values:
+        """Estimate of the variables in the window."""
         return self.isam.calculateEstimate()
+
+    def holds(self, key: int) -> bool:
+        """True for a variable in the window."""
+        return self.marginals.valueExists(key)
+
+    def can_exchange(self, removed: Sequence[gtsam.NonlinearFactor], keys: Iterable[int]) -> bool:
+        """True when the factors to be taken out, and the variables of those to be put in, are in the window."""
+        return self._slots(removed) is not None and all(map(self.holds, keys))
 
     def settle(self) -> None:
         """Update until nothing would be relinearised any more."""
-        for _ in range(MOST_SETTLING_UPDATES):
-            if self.isam.getDelta().norm() <= self._threshold:
-                break
-            self.isam.update()
+        settle(self.isam.update, self.isam, self._threshold)
 
-    def slots(self, factors: list[gtsam.NonlinearFactor]) -> list[int] | None:
+    def _slots(self, factors: Sequence[gtsam.NonlinearFactor]) -> list[int] | None:
         """Places of factors in the window; None when one of them is not there."""
         if not factors:
             return []

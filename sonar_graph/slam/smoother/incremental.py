@@ -26,17 +26,15 @@ from sonar_graph.slam.smoother.batch_solution import (
     KeptCovariance,
     Sightline,
     marginals_of,
+    picked,
     solve_in_sight,
 )
 from sonar_graph.slam.smoother.factor_store import FactorGroup, Factors, FactorStore
-from sonar_graph.slam.smoother.fixed_lag import SmootherWindow, picked, split, with_marginals
+from sonar_graph.slam.smoother.fixed_lag import FixedLagWindow, with_marginals
 from sonar_graph.slam.smoother.observability import Blame, Withheld, variable_name
+from sonar_graph.slam.smoother.submap_window import SubmapWindow
 from sonar_graph.tagged_sections import tagged
 
-RESTART_GROWTH = 1.25
-"""Number of factors, relative to that at the last restart, before the next one."""
-FIRST_RESTART = 100
-"""Number of factors before the first restart."""
 MOST_MESSAGES = 1000
 """Kept of what was withheld."""
 ROUNDING_S = 1e-6
@@ -50,8 +48,12 @@ class SmootherParams(Section):
     """Age from which poses are marginalised out of the incremental solution; a large value keeps all of them."""
     relinearize_threshold: float = Field(0.001, gt=0)
     """Change of a component of a variable (rad or m) above which the variable is relinearised."""
+    relinearize_every: int = Field(5, ge=1)
+    """Updates of which one relinearises, in a whole history; large changes do at once. A bounded one does at each."""
+    submap_keyframes: int = Field(50, ge=1)
+    """Number of keyframes older than the lag that are marginalised together, in a submap; of a whole history."""
     stale_shift_m: float = Field(0.1, gt=0)
-    """Distance that a landmark may move before the window starts again from a solution of the whole graph."""
+    """Distance that a landmark may move before a bounded window starts again from a solution of its graph."""
     waiting_gain: float = Field(5.0, ge=0)
     """New sightings enter the estimate at the next keyframe, or as soon as their expected gain, the sum of predicted
     variance over noise variance, exceeds this. 0: always at once."""
@@ -121,13 +123,18 @@ class Smoother:
         self._waiting_gain = 0.0
         self._refused: set[int] = set()
         self._left: set[int] = set()
-        self._restart_size = FIRST_RESTART
         self._restarted_s = self._newest_s = -np.inf
         self._expiring: dict[int, float] = {}
         self._held: dict[int, float] = {}
         self._landmarks: list[int] = []
         self._bias: list[int] = []
-        self._window = SmootherWindow(params.relinearize_threshold, params.lag_s)
+        self._window: FixedLagWindow | SubmapWindow
+        if departures is None:
+            self._window = SubmapWindow(
+                params.relinearize_threshold, params.lag_s, params.submap_keyframes, params.relinearize_every
+            )
+        else:
+            self._window = FixedLagWindow(params.relinearize_threshold, params.lag_s)
         self._taken_up = gtsam.NonlinearFactorGraph(), gtsam.Values()
         self._kept_covariance = KeptCovariance()
         self._solved: tuple[gtsam.Values, gtsam.Marginals | gtsam.ISAM2] | None = None
@@ -224,7 +231,7 @@ class Smoother:
         New landmarks come with first estimates; lost are those on which no factor is left.
         """
         self._flush(time_s)
-        slots = self._window.slots(self._store.factors(removed))
+        gone = self._store.factors(removed)
         self._forget(lost_landmarks)
         self._store.remove(removed)
         for key, point in (new_landmarks or {}).items():
@@ -233,11 +240,13 @@ class Smoother:
         self._withhold_unusable()
         keys = self._store.new_graph.keyVector()
         self._window.lag_s = self._lag_at(time_s, keeps_all=self.is_bounded)
-        if slots is None or lost_landmarks or len(self.in_window(keys)) < len(keys):
+        known = [key for key in keys if not self._new_values.exists(key)]
+        window = self._window
+        if isinstance(window, FixedLagWindow) and (lost_landmarks or not window.can_exchange(gone, known)):
             self._kept_covariance.renew(self._landmarks)
             self._restart(time_s)
         else:
-            self._update(time_s, self._window.lag_s, slots)
+            self._update(time_s, self._window.lag_s, gone)
             self.settle(time_s)
         return self._changed(handles)
 
@@ -248,7 +257,7 @@ class Smoother:
         except RuntimeError:
             self._give_up_cholesky(time_s)
         self._kept_covariance.outdate()
-        self._take(self._window.isam.calculateEstimate())
+        self._take(self._window.estimate())
 
     def _changed(self, added: Sequence[int] = ()) -> Changed:
         """Changes since the last answer."""
@@ -266,16 +275,15 @@ class Smoother:
 
     def in_window(self, keys: list[int]) -> list[int]:
         """Keys of variables that are in the window, or about to be."""
-        inside = self._window.isam.getLinearizationPoint() if keys else gtsam.Values()
-        return [key for key in keys if inside.exists(key) or self._new_values.exists(key)]
+        return [key for key in keys if self._window.holds(key) or self._new_values.exists(key)]
 
     def _forget(self, landmark_keys: Iterable[int]) -> None:
         for key in landmark_keys:
             self._landmarks.remove(key)
             self.values.erase(key)
 
-    def _update(self, time_s: float, lag_s: float, removed_slots: Sequence[int] = ()) -> None:
-        """Update the window, without what is in some places of it, and restart it where it is stale."""
+    def _update(self, time_s: float, lag_s: float, removed: Sequence[gtsam.NonlinearFactor] = ()) -> None:
+        """Update the window, without some of its factors, and restart a bounded one where it is stale."""
         self._expiring |= dict.fromkeys(self._bias, time_s)
         if self._departures is not None:
             old = (key for key, t in self._expiring.items() if t < time_s - lag_s)
@@ -284,19 +292,20 @@ class Smoother:
         self._window.lag_s = lag_s
         graph, times = self._store.new_graph, self._times(self._new_times_s, time_s)
         try:
-            estimate = self._window.update(graph, self._new_values, times, removed_slots)
+            estimate = self._window.update(graph, self._new_values, times, time_s, removed)
         except RuntimeError:
             if not self._go_without(time_s):
                 self._give_up_cholesky(time_s)
                 return
-            estimate = self._window.isam.calculateEstimate()
+            estimate = self._window.estimate()
         self._kept_covariance.renew(self._landmarks)
         self._clear_new()
         self._take(estimate)
-        since_s = self._restarted_s + self.params.lag_s
-        may_restart = time_s >= since_s if self.is_bounded else self._store.size >= self._restart_size
-        if may_restart and self._window.largest_shift(self._landmarks) > self.params.stale_shift_m:
-            self._restart(time_s)
+        window, may_restart = self._window, time_s >= self._restarted_s + self.params.lag_s
+        if isinstance(window, FixedLagWindow) and may_restart:
+            shift_m = window.largest_shift(self._landmarks)
+            if shift_m > self.params.stale_shift_m:
+                self._restart(time_s)
 
     def _times(self, poses_s: dict[int, float], time_s: float) -> dict[Any, float]:
         """When variables were last seen, from those of poses: landmarks and the newest bias are seen now."""
@@ -330,23 +339,25 @@ class Smoother:
     def _go_without(self, time_s: float) -> bool:
         """Solve the window without those new factors that are to blame; whether there are any.
 
-        The window is made anew of the same factors with the same linearisation: nothing else changes.
+        The window is made anew of the other factors: a bounded one with the same linearisation, so that nothing else
+        changes, else at the estimate.
         """
-        theta = gtsam.Values(self._new_values)
-        theta.insert_or_assign(self._window.isam.getLinearizationPoint())
         new = {factor for group in self._store.new.values() for factor in group}
-        before = with_marginals(self._window.isam.getFactors(), theta, new)
+        theta = gtsam.Values(self._new_values)
+        theta.insert_or_assign(self._window.linearised_at if self.is_bounded else self.values)
+        before = with_marginals(self._window.factors, theta, new)
         if not (found := self._blame().culprits(before, theta)):
             return False
         self._withhold(found)
         for key in set().union(*(withheld.keys for withheld in found)):
             theta.erase(key)
         before.push_back(self._store.new_graph)
-        kept_s = {key: self._expiring.get(key, time_s) for key in list(theta.keys())}
+        graph = before if self.is_bounded else self._store.graph()
+        times_s = {key: self._expiring.get(key, time_s) for key in list(theta.keys())}
         try:
-            self._window.begin(before, theta, self._times(kept_s, time_s))
+            self._window.begin(graph, theta, self._times(times_s, time_s), time_s)
         except RuntimeError as error:
-            raise EstimatorError(f"isam2: {self._blame().reasons(before, theta)}") from error
+            raise EstimatorError(f"isam2: {self._blame().reasons(graph, theta)}") from error
         return True
 
     def _take(self, estimate: gtsam.Values) -> None:
@@ -361,7 +372,7 @@ class Smoother:
             del self._expiring[key]
         self._left.update(left)
         self._store.leave(left)
-        self._taken_up = self._window.isam.getFactors(), self._window.isam.getLinearizationPoint()
+        self._taken_up = self._window.factors, self._window.linearised_at
 
     def _give_up_cholesky(self, time_s: float) -> None:
         """Go on by QR after Cholesky met a pose far less certain than its step; `EstimatorError` where QR fails too."""
@@ -375,19 +386,17 @@ class Smoother:
         self._new_values, self._new_times_s, self._waiting_gain = gtsam.Values(), {}, 0.0
 
     def _restart(self, time_s: float) -> None:
-        """Solve the history; start a window whose prior is the marginal of all that lies before it."""
+        """Solve the history; start the window from that."""
         graph = self.graph
         self._clear_new()
-        self._restart_size, self._restarted_s = max(FIRST_RESTART, int(RESTART_GROWTH * graph.size())), time_s
+        self._restarted_s = time_s
         self.values = solve_in_sight(graph, self.values, self._store.sightlines())
-        kept_s = {key: t for key, t in self._expiring.items() if t >= time_s - self._window.lag_s}
-        times: dict[Any, float] = kept_s | dict.fromkeys(self._landmarks, time_s)
-        inside, outside = split(graph, set(times))
+        times_s = self._expiring | dict.fromkeys(self._landmarks, time_s)
         try:
-            self._window.begin(inside, picked(self.values, times), times, (outside, self.values))
+            self._window.begin(graph, self.values, times_s, time_s)
         except RuntimeError as error:
             raise EstimatorError(f"isam2: {self._blame().reasons(graph, self.values)}") from error
-        self._take(self._window.isam.calculateEstimate())
+        self._take(self._window.estimate())
 
     @property
     def landmark_ids(self) -> list[int]:
@@ -397,7 +406,7 @@ class Smoother:
     @property
     def marginals(self) -> gtsam.ISAM2:
         """Source of covariances of variables in the window."""
-        return self._window.isam.getISAM2()
+        return self._window.marginals
 
     def joint_covariance(self, keys: list[int]) -> JointCovariance:
         """Joint marginal covariance of variables in the window, and possibly of more of them."""
@@ -416,6 +425,7 @@ class Smoother:
         """
         if self._solved is None:
             graph = self.graph
-            values = solve_in_sight(graph, self.values, self._store.sightlines())
+            start = self._window.carried(self.values) if isinstance(self._window, SubmapWindow) else self.values
+            values = solve_in_sight(graph, start, self._store.sightlines())
             self._solved = values, marginals_of(graph, values)
         return self._solved

@@ -1,0 +1,188 @@
+"""Smoothing of dense and long logs: time of each update, of the last solution, and nearness to the batch.
+
+The smoother with its defaults, asked after every frame, on
+
+* MRCLAM sets 6 and 9: planar robots that see 15 landmarks thousands of times, after much drift;
+* the DLR building: 3298 steps past 576 landmarks;
+* a synthetic survey of 1000 landmarks at 2 Hz, lane after lane: sighted a few times each, and again a lane later.
+
+Of each log one line of JSON:
+
+* ``max_update_ms``, ``p99_ms``: of single calls of `Isam2.process`, by this thread's processor time, so that what else
+  the machine does does not count (``max_wall_ms`` does); the mission before the first log loads what is compiled;
+* ``finish_s``: the batch solution at the end with all landmarks' covariances, processor time;
+* ``landmark_gap_m``: largest distance of a landmark between the live estimate and that solution;
+* ``sigma_ratio``: largest ratio, or its inverse, of live standard deviations to those of ``gtsam.Marginals`` at the
+  batch solution: the newest keyframe's horizontal position and yaw, and the landmarks' horizontal position;
+
+and ``real_time_ratio``, processor time of all calls over the length of the log.
+
+The last line has the worst of all logs.
+"""
+
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from gtsam.symbol_shorthand import L
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+from common import conclude, make_parser, note, print_figures, recording
+
+from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, PlanarMotion, SonarCalibration
+from sonar_graph.logs.convert import read_dlr, read_mrclam
+from sonar_graph.measurements import NS_PER_S, Dvl, Imu, LandmarkDetections
+from sonar_graph.navigation import Odometry
+from sonar_graph.sequence import Sequence
+from sonar_graph.simulation import MissionOptions, simulate_mission
+from sonar_graph.slam import Isam2
+
+TARGETS = {
+    "max_update_ms": 100.0,
+    "p99_ms": 20.0,
+    "finish_s": 5.0,
+    "landmark_gap_m": 0.05,
+    "sigma_ratio": 1.1,
+    "real_time_ratio": 1.0,
+}
+RATE_HZ = 2.0
+GYRO_NOISE, SPEED_SIGMA_M_S, RANGE_SIGMA_M, AZIMUTH_SIGMA_RAD = 2e-3, 0.05, 0.05, 0.01
+LANE_M, APART_M, SPEED_M_S, RANGE_MAX_M, HALF_APERTURE_RAD = 100.0, 6.0, 1.0, 10.0, 1.0
+
+
+def survey(landmarks: int = 1000, seed: int = 1) -> Sequence:
+    """Lanes of 100 m, 6 m apart, over landmarks at random; all lie in the plane."""
+    rng = np.random.default_rng(seed)
+    lanes = max(2, round(landmarks / 80))
+    points = rng.uniform((0.0, -2.0), (LANE_M, lanes * APART_M + 2.0), (landmarks, 2))
+    lane, turn = round(LANE_M / SPEED_M_S * RATE_HZ), round(np.pi * APART_M / 2 / SPEED_M_S * RATE_HZ)
+    rates = []
+    for k in range(lanes):
+        side = 1.0 if k % 2 == 0 else -1.0
+        rates += [0.0] * lane + [side * np.pi * RATE_HZ / turn] * turn
+    n, dt = len(rates), 1.0 / RATE_HZ
+    heading = np.concatenate([[0.0], np.cumsum(rates) * dt])
+    middle = 0.5 * (heading[1:] + heading[:-1])
+    chord = SPEED_M_S * dt * np.sinc(np.array(rates) * dt / (2 * np.pi))
+    xy = np.vstack([[0.0, 0.0], np.cumsum(np.column_stack([chord * np.cos(middle), chord * np.sin(middle)]), axis=0)])
+    stamps_ns = (np.arange(n + 1) * (NS_PER_S // round(RATE_HZ))).astype(np.int64)
+    gyro, velocity = np.zeros((n + 1, 3)), np.zeros((n + 1, 3))
+    gyro[1:, 2] = rates + GYRO_NOISE / np.sqrt(dt) * rng.standard_normal(n)
+    velocity[1:, 0] = SPEED_M_S
+    velocity[1:, :2] += SPEED_SIGMA_M_S * rng.standard_normal((n, 2))
+    rows = []
+    for k in range(1, n + 1):
+        away = points - xy[k]
+        distance = np.hypot(*away.T)
+        azimuth = (np.arctan2(away[:, 1], away[:, 0]) - heading[k] + np.pi) % (2 * np.pi) - np.pi
+        seen = np.flatnonzero((distance < RANGE_MAX_M) & (np.abs(azimuth) < HALF_APERTURE_RAD)).tolist()
+        rows += [(k, i, distance[i], azimuth[i]) for i in seen]
+    frames, ids, distances, azimuths = (np.array(column) for column in zip(*rows, strict=True))
+    m = len(rows)
+    detections = LandmarkDetections(
+        stamps_ns[frames],
+        distances + RANGE_SIGMA_M * rng.standard_normal(m),
+        azimuths + AZIMUTH_SIGMA_RAD * rng.standard_normal(m),
+        np.tile(np.diag([RANGE_SIGMA_M**2, AZIMUTH_SIGMA_RAD**2]), (m, 1, 1)),
+        ids[:, None],
+        np.ones((m, 1)),
+    )
+    calibration = Calibration(
+        imu=ImuCalibration(gyro_noise_density=GYRO_NOISE, gyro_bias_sigma=0.0, gyro_bias_walk_density=0.0),
+        dvl=DvlCalibration(velocity_sigma_m_s=(SPEED_SIGMA_M_S, SPEED_SIGMA_M_S, 1e-3)),
+        sonar=SonarCalibration(range_sigma_m=RANGE_SIGMA_M, azimuth_sigma_rad=AZIMUTH_SIGMA_RAD),
+        planar=PlanarMotion(),
+        use_gravity=False,
+        odometry_interpolation="hold-past",
+    )
+    cov = np.tile(np.diag(np.square(calibration.dvl.velocity_sigma_m_s)), (n + 1, 1, 1))
+    return Sequence(
+        name=f"survey of {landmarks} landmarks",
+        calibration=calibration,
+        imu=Imu(stamps_ns, gyro, np.full((n + 1, 3), np.nan)),
+        dvl=Dvl(stamps_ns, velocity, cov),
+        detections=detections,
+    )
+
+
+def run(sequence: Sequence, until_s: float | None = None) -> dict[str, Any]:
+    """Figures of one log."""
+    assert sequence.detections is not None
+    stamps = np.unique(sequence.detections.stamps_ns)
+    end_ns = sequence.end_ns if until_s is None else sequence.start_ns + round(until_s * NS_PER_S)
+    stamps = stamps[(stamps > sequence.start_ns) & (stamps <= end_ns)]
+    estimator = Isam2(sequence.calibration, Odometry(sequence.calibration))
+    cpu_s, wall_s = [], []
+    for step in sequence.replay(stamps):
+        cpu, wall = time.thread_time(), time.perf_counter()
+        estimator.process(step)
+        cpu_s.append(time.thread_time() - cpu)
+        wall_s.append(time.perf_counter() - wall)
+    live = estimator.values
+    newest = estimator.keyframe_count - 1
+    start = time.thread_time()
+    batch = estimator.landmarks()
+    finish_s = time.thread_time() - start
+    gaps_m = [np.linalg.norm(live.atPoint3(L(i)) - p) for i, p in zip(batch.ids, batch.positions, strict=True)]
+    ratios = [sigmas(estimator, "window", keyframe=newest) / sigmas(estimator, "history", keyframe=newest)]
+    for i, exact in zip(batch.ids.tolist(), batch.covariances, strict=True):
+        ratios.append(sigmas(estimator, "window", landmark=i) / np.sqrt(np.diag(exact)[:2]))
+    ratio = np.concatenate(ratios)
+    cpu_ms = 1e3 * np.array(cpu_s)
+    return {
+        "log": sequence.name,
+        "updates": len(stamps),
+        "keyframes": newest + 1,
+        "landmarks": len(batch),
+        "median_ms": float(np.median(cpu_ms)),
+        "p99_ms": float(np.quantile(cpu_ms, 0.99)),
+        "max_update_ms": float(cpu_ms.max()),
+        "max_wall_ms": 1e3 * max(wall_s),
+        "finish_s": finish_s,
+        "landmark_gap_m": float(max(gaps_m)),
+        "sigma_ratio": float(np.maximum(ratio, 1.0 / ratio).max()),
+        "real_time_ratio": sum(cpu_s) * NS_PER_S / float(stamps[-1] - stamps[0]),
+    }
+
+
+def sigmas(estimator: Isam2, over: Literal["window", "history"], **of: int) -> np.ndarray:
+    """Standard deviations of yaw and horizontal position of a keyframe, or of the horizontal position of a landmark."""
+    variances = np.diag(estimator.marginal(**of, over=over))
+    return np.sqrt(variances[[2, 3, 4]] if "keyframe" in of else variances[:2])
+
+
+def logs(data: Path | str | None, *, is_quick: bool) -> Iterator[Sequence]:
+    """Logs, one at a time."""
+    yield survey(100 if is_quick else 1000)
+    for number in (9,) if is_quick else (9, 6):
+        with recording(data, f"mrclam_ds{number}.tar.xz", f"MRCLAM_Dataset{number}") as folder:
+            for robot in (1,) if is_quick else sorted(int(path.name[5]) for path in folder.glob("Robot?_Odometry.dat")):
+                yield read_mrclam(folder, robot)
+    if not is_quick:
+        with recording(data, "dlr.tar.xz", "dlr") as folder:
+            yield read_dlr(folder)
+
+
+def main() -> None:
+    parser = make_parser(__doc__, data=True)
+    parser.add_argument("--only", default="", help="logs whose name contains this")
+    arguments = parser.parse_args()
+    note("warming up: compiled functions load at their first use")
+    run(simulate_mission(MissionOptions(duration_s=20.0)))
+    found = []
+    for sequence in logs(arguments.data, is_quick=arguments.quick):
+        if arguments.only in sequence.name:
+            found.append(run(sequence, 120.0 if arguments.quick else None))
+            print_figures(found[-1])
+    figures: dict[str, Any] = {name: max(each[name] for each in found) for name in TARGETS}
+    for name, limit in TARGETS.items():
+        print(f"{name}: {figures[name]:.3f}, target at most {limit:g}")
+    figures["passed"] = all(figures[name] <= limit for name, limit in TARGETS.items())
+    conclude({"logs": len(found), **figures}, is_quick=arguments.quick)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,173 @@
+"""Submaps against the marginals and solutions of all factors."""
+
+import gtsam
+import numpy as np
+import pytest
+from gtsam.symbol_shorthand import B, L, X
+
+from sonar_graph.slam.smoother import submap_window
+from sonar_graph.slam.smoother.batch_solution import picked
+from sonar_graph.slam.smoother.submap_window import Submap
+from sonar_graph.slam.smoother.submaps import SubmapFactor, level_frame
+
+from .fed import Fed, assert_is_least_squares, in_the_basin, on_the_rail
+from .graphs import off_sigmas
+from .made import graph_of, point_prior, pose_prior, values_of
+from .rail import STEP_S, rail
+
+KEYS = [X(3), X(9), L(1), L(2), B(0)]
+SIZES = {X(3): 6, X(9): 6, L(1): 3, L(2): 3, B(0): 3}
+
+
+def some_values(seed: int, spread: float = 1.0) -> gtsam.Values:
+    rng = np.random.default_rng(seed)
+    poses = {f"X{k}": gtsam.Pose3.Expmap(spread * rng.normal(size=6) * [0.4, 0.4, 2.0, 3, 3, 3]) for k in (3, 9)}
+    return values_of(**poses, L1=5 * rng.normal(size=3), L2=5 * rng.normal(size=3), B0=0.01 * rng.normal(size=3))
+
+
+def moved_by(values: gtsam.Values, step: dict[int, np.ndarray]) -> gtsam.Values:
+    vector = values.zeroVectors()
+    moved = gtsam.VectorValues()
+    for key in SIZES:
+        moved.insert(key, step.get(key, vector.at(key)))
+    return values.retract(moved)
+
+
+def random_summary(values: gtsam.Values) -> tuple[np.ndarray, np.ndarray, gtsam.CustomFactor]:
+    rng = np.random.default_rng(7)
+    A, b = rng.normal(size=(21, 21)), rng.normal(size=21)
+    return A, b, SubmapFactor(KEYS, A, b, values).factor()
+
+
+def test_where_it_was_made_a_summary_is_the_marginal():
+    values = some_values(0)
+    A, b, factor = random_summary(values)
+    found_A, found_b = factor.linearize(values).jacobian()
+    assert found_A == pytest.approx(A, abs=1e-12)
+    assert found_b == pytest.approx(b, abs=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_elsewhere_its_derivative_is_that_of_its_error(seed):
+    """Frame, poses, landmarks and biases, far from where it was made; with an absolute part."""
+    _, _, factor = random_summary(some_values(0))
+    values = some_values(seed + 1)
+    found, _ = factor.linearize(values).jacobian()
+    columns = []
+    for key, size in SIZES.items():
+        for i in range(size):
+            ends = [factor.unwhitenedError(moved_by(values, {key: h * np.eye(size)[i]})) for h in (1e-6, -1e-6)]
+            columns.append((ends[0] - ends[1]) / 2e-6)
+    assert found == pytest.approx(np.array(columns).T, abs=1e-7 * np.abs(found).max())
+
+
+def basin_submap(*more: gtsam.NonlinearFactor) -> tuple[Submap, gtsam.Values]:
+    """Keyframes 3 to 7 of the basin with all that touches them."""
+    fed, interior = in_the_basin(12, 1e9), [X(k) for k in range(3, 8)]
+    values = fed.smoother.solve_history()[0]
+    factors = [f for f in [*fed.given, *more] if not set(interior).isdisjoint(f.keys())]
+    submap = Submap(interior, dict.fromkeys(factors), picked(values, interior))
+    submap.linearise(values)
+    return submap, values
+
+
+def driven_on(values: gtsam.Values) -> gtsam.Values:
+    """All moved as one in the plane, by a right angle and some metres."""
+    motion, moved = gtsam.Pose3(gtsam.Rot3.Rz(1.6), np.array([4.0, -7.0, 0.0])), gtsam.Values(values)
+    for key in list(values.keys()):
+        if gtsam.symbolChr(key) == ord("x"):
+            moved.update(key, motion.compose(values.atPose3(key)))
+        elif gtsam.symbolChr(key) == ord("l"):
+            moved.update(key, motion.transformFrom(values.atPoint3(key)))
+    return moved
+
+
+def test_a_submap_that_moves_as_a_whole_stays_exact():
+    """Odometry, ranges and azimuths say the same of it anywhere; a fix of a position, once moved, does not."""
+    fix = pose_prior(X(5), gtsam.Pose3(), 0.1)
+    for more, is_relative in (((), True), ((fix,), False)):
+        submap, values = basin_submap(*more)
+        (factor,) = submap.marginals
+        moved = driven_on(values)
+        anew, _ = basin_submap(*more)
+        anew.values = picked(moved, anew.interior)
+        anew.summary = None
+        anew.linearise(moved)
+        found, expected = (f.linearize(moved).augmentedInformation() for f in (factor, anew.marginals[0]))
+        scale = np.abs(expected).max()
+        assert np.allclose(found[:-1, :-1], expected[:-1, :-1], atol=1e-6 * scale) == is_relative
+        assert (factor.error(moved) == pytest.approx(factor.error(values), abs=1e-6)) == is_relative
+
+
+def test_the_frame_of_a_turned_pose_turns_with_it():
+    pose, motion = gtsam.Pose3.Expmap(np.array([0.3, -0.5, 2.0, 1, 2, 3])), gtsam.Pose3(gtsam.Rot3.Rz(2.5), [1, 2, 0])
+    assert level_frame(motion.compose(pose)).equals(motion.compose(level_frame(pose)), 1e-9)
+
+
+@pytest.mark.parametrize("most", [1, 3])
+def test_joined_submaps_are_least_squares(monkeypatch, most):
+    """Joined two by two until few are left; late ranges come to, and go from, keyframes inside and between them."""
+    monkeypatch.setattr(submap_window, "MOST", most)
+    nodes = 31
+    _, numbers = rail(nodes)
+    fed = on_the_rail(nodes, 2.6)
+    window = fed.smoother._window
+    assert len(window._submaps) <= most < len(window._whole) / 2
+    assert_is_least_squares(fed, numbers, nodes)
+    kept = [r for r in numbers.ranges if not 7 <= r[0] <= 12]
+    gone = [handle for k, i, _ in numbers.ranges if 7 <= k <= 12 for handle in fed.handles_on(X(k), L(i))]
+    assert gone
+    fed.smoother.exchange((nodes - 1) * STEP_S, gone)
+    numbers = type(numbers)(numbers.displacements_m, kept)
+    assert_is_least_squares(fed, numbers, nodes)
+    mean, _ = numbers.solution(nodes)
+    for k in range(nodes):
+        x = fed.smoother.solve_history()[0].atPose3(X(k)).translation()[0]
+        assert x == pytest.approx(mean[f"x{k}"], abs=1e-8)
+
+
+@pytest.mark.parametrize("most", [24, 2])
+def test_in_the_basin_the_window_stays_near_the_batch(monkeypatch, most):
+    """After twenty circles: landmarks to half their sigmas, joint covariances to a tenth."""
+    monkeypatch.setattr(submap_window, "MOST", most)
+    fed, keys = in_the_basin(80, 4.0), [X(79), L(3), L(5), L(8)]
+    batch, _ = fed.smoother.solve_history()
+    exact = fed.dense(batch, *keys)
+    for i in (3, 5, 8):
+        sigma_m = np.sqrt(fed.dense(batch, L(i)).diagonal().max())
+        assert np.linalg.norm(fed.smoother.values.atPoint3(L(i)) - batch.atPoint3(L(i))) < 0.5 * sigma_m
+    assert off_sigmas(fed.joint(*keys), exact) < 0.1
+
+
+def test_an_update_linearises_one_submap_at_most_besides_new_ones(monkeypatch):
+    counts: list[int] = []
+    linearise = Submap.linearise
+
+    def counting(submap: Submap, *arguments) -> None:
+        counts[-1] += 1
+        linearise(submap, *arguments)
+
+    update = submap_window.SubmapWindow.update
+
+    def watched(*arguments, **more) -> gtsam.Values:
+        counts.append(0)
+        return update(*arguments, **more)
+
+    monkeypatch.setattr(Submap, "linearise", counting)
+    monkeypatch.setattr(submap_window.SubmapWindow, "update", watched)
+    fed: Fed = in_the_basin(60, 4.0)
+    assert len(fed.smoother._window._whole) > 20
+    assert max(counts) <= 3
+    assert sum(counts) > len(fed.smoother._window._whole)
+
+
+def test_a_submap_on_which_no_pose_hangs_is_a_prior_of_the_rest():
+    """A keyframe with a landmark, and no odometry to others."""
+    values = values_of(X1=gtsam.Pose3(), L1=np.ones(3))
+    seen = gtsam.RangeFactor3D(X(1), L(1), 1.7, gtsam.noiseModel.Isotropic.Sigma(1, 0.1))
+    submap = Submap([X(1)], dict.fromkeys([pose_prior(X(1), gtsam.Pose3(), 0.1), seen]), picked(values, [X(1)]))
+    submap.linearise(values)
+    together = graph_of([*submap.marginals, point_prior(L(1), np.ones(3), 1.0)])
+    exact = graph_of([*submap.factors, point_prior(L(1), np.ones(3), 1.0)])
+    found = gtsam.Marginals(together, values_of(L1=np.ones(3))).marginalCovariance(L(1))
+    assert found == pytest.approx(gtsam.Marginals(exact, values).marginalCovariance(L(1)), rel=1e-9)
