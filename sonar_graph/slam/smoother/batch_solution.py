@@ -36,8 +36,8 @@ def solve(
 
     Minimises the sum of squared whitened (and robustly weighted) errors. Damping multiplies the identity; it starts
     negligible (a Gauss–Newton step) and grows tenfold while a step does not lower the error (Nocedal and Wright,
-    Numerical Optimization, section 10.3). A step twice as long is taken where it lowers the error more: those of a
-    robust kernel fall short, since its weights are held while a step is solved for.
+    Numerical Optimization, section 10.3). A step is doubled while that lowers the error more: those of a robust
+    kernel fall short, since its weights are held while a step is solved for.
 
     Returns
     -------
@@ -64,9 +64,12 @@ def solve(
         else:
             break
         damping = max(damping / DAMPING_FACTOR, FIRST_DAMPING)
-        further = values.retract(step.scale(2.0))  # weights that each step makes anew make steps too short
-        further_error = graph.error(further)
-        if further_error < candidate_error:
+        while True:  # weights that are made anew with each step make steps too short
+            step = step.scale(2.0)
+            further = values.retract(step)
+            further_error = graph.error(further)
+            if not further_error < candidate_error:
+                break
             candidate, candidate_error = further, further_error
         decrease = error - candidate_error
         values, error = candidate, candidate_error

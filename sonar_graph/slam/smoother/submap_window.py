@@ -27,7 +27,7 @@ SETTLED = 0.002
 """Decrease of the error (half a sum of squares) a keyframe, by a step of those of a submap, up to which they rest."""
 AT_ONCE = 100.0
 """Shift, in thresholds of relinearisation, from which on the next update relinearises."""
-MOST = 24
+MOST = 100
 """Submaps from which on neighbours are joined."""
 MOST_ROWS = 120
 """Rows of what a joined submap shares with the rest, at most: it is dense."""
