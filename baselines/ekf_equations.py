@@ -2,7 +2,7 @@
 
 ::
 
-    x = [X, Y, Z, phi, theta, psi, p_1, ..., p_N]            (4)  p_i: landmark in the world, 3 numbers
+    x = [X, Y, Z, phi, theta, psi, c, p_1, ..., p_N]         (4)  p_i: landmark in the world, 3 numbers
     P = [ P_vv  P_vm ; P_vm^T  P_mm ]                        (5)
     z_hat = h(x_v, p)                                        (6)  range and azimuth
     e = z - z_hat, azimuth wrapped                           (7)
@@ -15,6 +15,7 @@ the pose after the motion, in the body's own axes, to which state and motion con
                                             [ dR^T R^T   -dR^T [dp]x W     ]
 
 A point q of the body moves by ``R' (rho - [q]x theta)``: along a direction n, in body axes, ``H_b = [(q x n)^T, n^T]``.
+The paper has no headings: c, the constant bias of a compass, is ours, and without headings nothing is learnt of it.
 W, E: `sonar_graph.numerics.matrices`. Derivation and choices that the paper leaves open: docs/theory/ekf_slam.md.
 """
 
@@ -26,7 +27,10 @@ from baselines.filter import GATED, Gate, Motion, SonarModel, admit, correction,
 from sonar_graph.measurements import Floats
 from sonar_graph.numerics import (
     I3,
+    LOWER_LEFT,
+    LOWER_RIGHT,
     O3,
+    UPPER_RIGHT,
     Mat3,
     Mat6,
     Vec3,
@@ -45,10 +49,17 @@ from sonar_graph.numerics import (
     store6,
     vec,
 )
-from sonar_graph.slam.models import FLOOR_GATE, sonar_point, sonar_point_jacobian, wrap_angle
+from sonar_graph.slam.models import (
+    FLOOR_GATE,
+    doubted,
+    sonar_point,
+    sonar_point_jacobian,
+    wrap_angle,
+    yaw_and_derivative,
+)
 
-POSE, LANDMARK = 6, 3
-"""Lengths of x_v and of p_i."""
+POSE, COMPASS, MAP, LANDMARK = 6, 6, 7, 3
+"""Length of x_v, place of c, that of p_1, and length of p_i."""
 
 # -------------------------------------------------------------------------------- prediction
 
@@ -82,13 +93,15 @@ def after(x: Floats, dR_: Floats, dp_: Floats) -> tuple[Mat3, Vec3, Mat6]:
 
 
 @compiled
-def pose_after(x: Floats, P: Floats, dR: Floats, dp: Floats, C: Floats) -> tuple[Floats, Floats, Floats]:
-    """Pose of the body a motion after the state: R' (3, 3), X' (3,), and the covariance ``T P_vv T^T + C`` of delta."""
-    (R, X, T), R_after, X_after, cov = after(x, dR, dp), np.empty((3, 3)), np.empty(3), np.empty((6, 6))
+def pose_after(x: Floats, dR: Floats, dp: Floats) -> tuple[Floats, Floats, Floats]:
+    """Pose of the body a motion after the state, and the state's part in its perturbation: R' (3, 3), X' (3,), T."""
+    (R, X, of_state), R_after, X_after, T = after(x, dR, dp), np.empty((3, 3)), np.empty(3), np.zeros((6, 6))
     store(R, R_after)
     X_after[0], X_after[1], X_after[2] = X
-    store6(T @ mat6(P) @ T.T + mat6(C), cov)
-    return R_after, X_after, cov
+    store(of_state.b, T, UPPER_RIGHT)
+    store(of_state.c, T, LOWER_LEFT)
+    store(of_state.d, T, LOWER_RIGHT)
+    return R_after, X_after, T
 
 
 @inlined
@@ -144,6 +157,12 @@ def observe(
     return outcome
 
 
+def by_perturbation(R: Floats, q: Floats) -> Floats:
+    """``R' [-[q]x  I]``: derivative of a point q of the body by delta, shape (3, 6)."""
+    minus_q_x = np.array([[0.0, q[2], -q[1]], [-q[2], 0.0, q[0]], [q[1], -q[0], 0.0]])
+    return np.concatenate((R @ minus_q_x, R), axis=1)
+
+
 def location(
     x: Floats, motion: Motion, sonar: SonarModel, z: Floats, elevation_rad: float | None = None
 ) -> tuple[Floats, Floats, Floats, Floats]:
@@ -152,14 +171,13 @@ def location(
     Returns g (3,); ``G_v = G_b T`` by x_v (3, 6); ``G_b = R' [-[q]x  I]`` by delta (3, 6); G_z by (range, azimuth,
     elevation) (3, 3).
     """
-    R, X, (a, b, c, d) = (np.array(part) for part in after(x, motion.dR, motion.dp))
+    R, X, T = pose_after(x, motion.dR, motion.dp)
     if elevation_rad is None:
         elevation_rad = sonar.elevation_of_new(R, X, z)
     q = sonar.body_p_sonar + sonar.body_R_sonar @ sonar_point(z[0], z[1], elevation_rad)
-    minus_q_x = np.array([[0.0, q[2], -q[1]], [-q[2], 0.0, q[0]], [q[1], -q[0], 0.0]])
-    G_b = np.concatenate((R @ minus_q_x, R), axis=1)
+    G_b = by_perturbation(R, q)
     G_z = R @ sonar.body_R_sonar @ sonar_point_jacobian(z[0], z[1], elevation_rad)
-    return X + R @ q, G_b @ np.block([[a, b], [c, d]]), G_b, G_z
+    return X + R @ q, G_b @ T, G_b, G_z
 
 
 def observe_far(
@@ -227,6 +245,31 @@ def correct_depth(
     S[0, 0] = share + H_b @ (mat6(C) @ H_b) + variance
     e[0] = z_m - (x[2] + R.z @ dp + up @ q)
     correct(x, P, U, S, e)
+
+
+def correct_heading(x: Floats, P: Floats, motion: Motion, yaw_rad: float, variance_rad2: float) -> None:
+    """Update by a compass, ``psi' + c`` (`yaw_and_derivative`)."""
+    R, _, T = pose_after(x, motion.dR, motion.dp)
+    yaw, by_turn = yaw_and_derivative(R)
+    H_b = np.array([[*by_turn, 0.0, 0.0, 0.0]])
+    e = np.array([wrap_angle(yaw_rad - yaw - x[COMPASS])])
+    correct_robustly(x, P, motion, T, H_b, 1.0, e, np.array([[variance_rad2]]))
+
+
+def correct_position(x: Floats, P: Floats, motion: Motion, q: Floats, position_m: Floats, cov_m2: Floats) -> None:
+    """Update by the position of a point q of the body, ``X' + R' q``."""
+    R, X, T = pose_after(x, motion.dR, motion.dp)
+    correct_robustly(x, P, motion, T, by_perturbation(R, q), 0.0, position_m - X - R @ q, cov_m2)
+
+
+def correct_robustly(
+    x: Floats, P: Floats, motion: Motion, T: Floats, H_b: Floats, by_compass: float, e: Floats, R: Floats
+) -> None:
+    """Update by m numbers that depend on delta and c, ``H = [H_b T, by_compass, 0]``, of which some are outliers."""
+    H = np.zeros((len(e), len(x)))
+    H[:, :POSE], H[:, COMPASS] = H_b @ T, by_compass
+    U = H @ P
+    correct(x, P, U, doubted(e, U @ H.T + H_b @ motion.C @ H_b.T + R, R), e)
 
 
 # -------------------------------------------------------------------------------- augmentation

@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 
 from baselines import ekf_equations
-from baselines.ekf_equations import LANDMARK, POSE, correct_depth, correct_up, observe, predict
+from baselines.ekf_equations import COMPASS, LANDMARK, MAP, POSE, correct_depth, correct_up, observe, predict
 from baselines.filter import (
     DEPTH,
     EPOCH,
@@ -66,7 +66,7 @@ def advance(
                     if events.landmark[row] < 0:
                         return k
                     events.outcome[row] = observe(
-                        x, P, POSE + LANDMARK * events.landmark[row], dR[k], dp[k], C[k], body_R_sonar, body_p_sonar,
+                        x, P, MAP + LANDMARK * events.landmark[row], dR[k], dp[k], C[k], body_R_sonar, body_p_sonar,
                         events.z[row], events.R_z[row], gate, events.e[row], events.S[row],
                     )  # fmt: skip
                 row += 1
@@ -113,10 +113,11 @@ class EkfSlam(FilterShell):
     def __init__(self, calibration: Calibration, odometry: MotionSource, params: EkfSlamParams | None = None) -> None:
         super().__init__(calibration, odometry, params or EkfSlamParams())
         start = calibration.start
-        self._x, self._P = np.array([*start.position_m, *start.pose().rotation().rpy()]), np.zeros((POSE, POSE))
+        self._x, self._P = np.array([*start.position_m, *start.pose().rotation().rpy(), 0.0]), np.zeros((MAP, MAP))
         E = np.linalg.inv(np.array(ekf_equations.after(self._x, np.eye(3), np.zeros(3))[2].b))  # W^-1
         self._P[:3, :3] = np.diag(np.square(start.position_sigma_m))
-        self._P[3:, 3:] = E @ np.diag(np.square(start.rpy_sigma_rad)) @ E.T
+        self._P[3:6, 3:6] = E @ np.diag(np.square(start.rpy_sigma_rad)) @ E.T
+        self._P[COMPASS, COMPASS] = calibration.heading.bias_sigma_rad**2
 
     def state(self) -> tuple[int, Floats, Floats]:
         """Stamp (ns), x of equation (4) and P of (5) at the newest epoch; copies."""
@@ -145,11 +146,19 @@ class EkfSlam(FilterShell):
         for k, (value, sigma) in enumerate([(plane.z_m, plane.z_sigma_m), tilt, tilt], start=2):
             ekf_equations.correct_number(self._x, self._P, k, value, sigma**2)
 
+    def correct_heading(self, motion: Motion, yaw_rad: float, variance_rad2: float) -> None:
+        """Update by the yaw of the body and the compass' bias."""
+        ekf_equations.correct_heading(self._x, self._P, motion, yaw_rad, variance_rad2)
+
+    def correct_position(self, motion: Motion, point: Floats, position_m: Floats, cov_m2: Floats) -> None:
+        """Update by the position of a point of the body."""
+        ekf_equations.correct_position(self._x, self._P, motion, point, position_m, cov_m2)
+
     def observe(
         self, motion: Motion, slot: int, z: Floats, R_z: Floats, *, may_be_far: bool
     ) -> tuple[int, Floats, Floats]:
         """Update by range and azimuth of a known landmark, (6) and (7)."""
-        at, sonar = POSE + LANDMARK * slot, self.sonar
+        at, sonar = MAP + LANDMARK * slot, self.sonar
         if may_be_far and (told := ekf_equations.observe_far(self._x, self._P, at, motion, sonar, z, R_z)) is not None:
             return told
         dR, dp, C, _, _ = motion
@@ -162,11 +171,13 @@ class EkfSlam(FilterShell):
 
     def pose_after(self, motion: Motion) -> tuple[Floats, Floats, Floats]:
         """world_R_body (3, 3), position (3,), and covariance of [theta, rho] (6, 6) a motion after the state."""
-        return ekf_equations.pose_after(self._x, self._P, motion.dR, motion.dp, motion.C)
+        R, X, T = ekf_equations.pose_after(self._x, motion.dR, motion.dp)
+        cov = T @ self._P[:POSE, :POSE] @ T.T + motion.C
+        return R, X, 0.5 * (cov + cov.T)
 
     def landmark(self, slot: int) -> tuple[Floats, Floats]:
         """Position, and its block of (5)."""
-        block = slice(POSE + LANDMARK * slot, POSE + LANDMARK * (slot + 1))
+        block = slice(MAP + LANDMARK * slot, MAP + LANDMARK * (slot + 1))
         return self._x[block], self._P[block, block]
 
     def attitude(self) -> Floats:

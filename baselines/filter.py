@@ -1,14 +1,16 @@
 """Shell of both landmark filters: the contract, the order of events, and the outcomes of detections.
 
 A filter's state sits at an epoch, a stamp of the Doppler log. Events happen in the order of their stamps, whatever the
-calls in which measurements arrive: an epoch when it is reached, a depth sample, then the detections of a frame. What is
-measured at an instant is related to the newest epoch reached by then, through a motion from rows stamped no later::
+calls in which measurements arrive: an epoch when it is reached, a depth sample, a heading, a position fix, then the
+detections of a frame. What is measured at an instant is related to the newest epoch reached by then, through a motion
+from rows stamped no later::
 
     epoch i --- epoch j          predict; then the plane, and gravity where an interval of it ends here
-          i -------- t           depth sample, frame, or estimate at the end of the call
+          i -------- t           depth, heading, position fix, frame, or estimate at the end of the call
+    t' ------ i                  position fix that comes late, by the motion backwards (`FilterShell._use_late`)
 
 Measurements that are related to one epoch over the same gap of the Doppler log share its error. The k-th gets k (k + 1)
-times the motion's covariance: together those of one kind, depths or detections, tell no more than one exact
+times the motion's covariance: together those of one kind, such as depths or detections, tell no more than one exact
 measurement, ``sum 1 / (k (k + 1)) = 1``.
 
 Far landmarks (`far_view`) and the choices that the paper leaves open: docs/theory/ekf_slam.md, docs/theory/gaps.md.
@@ -16,7 +18,7 @@ Far landmarks (`far_view`) and the choices that the paper leaves open: docs/theo
 
 import math
 from abc import ABC, abstractmethod
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
@@ -25,7 +27,7 @@ from pydantic import Field
 
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
 from sonar_graph.errors import EstimatorError
-from sonar_graph.measurements import Depth, Floats, Ints, LandmarkDetections, Measurements
+from sonar_graph.measurements import Depth, Floats, Heading, Ints, LandmarkDetections, Measurements, PositionFixes
 from sonar_graph.motion import Motions, MotionSource, require_source
 from sonar_graph.navigation.alignment import earth_rate_in_world, tilt_sigma, up_direction
 from sonar_graph.numerics import I3, LOWER_LEFT, ZERO, compiled, cross, exp_and_mean, mat, store, vec
@@ -39,6 +41,7 @@ from sonar_graph.states import (
     Estimate,
     LandmarkMap,
     Outcome,
+    Refusal,
     RefusedRow,
     Trajectory,
 )
@@ -100,7 +103,7 @@ def up_at_end(i_R_j: Floats, impulse: Floats, interval: Floats) -> Floats:
     return up
 
 
-EPOCH, PLANE, GRAVITY, DEPTH, FRAME, END = range(6)
+EPOCH, PLANE, GRAVITY, DEPTH, HEADING, FIX, FRAME, END = range(8)
 """Kinds of events; at equal stamps the lower comes first, but plane and gravity right after their epoch."""
 USED, GATED, NEW, LET_IN = (OUTCOME_NUMBERS[o] for o in (Outcome.USED, Outcome.GATED, Outcome.NEW, Outcome.LET_IN))
 OUTLYING, JUDGED_TOGETHER = -2.0 * math.log(0.001), 10
@@ -138,7 +141,7 @@ class Events(NamedTuple):
     end_ns: Ints
     kind: Ints
     row: Ints
-    """Number of the depth sample, interval of gravity, or first detection of the frame."""
+    """Number of the sample in its block, of the interval of gravity, or of the first detection of the frame."""
     dR: Floats
     """Columns of `Motions`; NaN over a gap, until that is bridged."""
     dp: Floats
@@ -148,7 +151,7 @@ class Events(NamedTuple):
     has_rate: NDArray[np.bool_]
     """True where a gyro bias and the Earth's rate are still in a motion."""
     z_m: Floats
-    """Depth samples, with their variances; NaN: that of the calibration."""
+    """Depths, with their variances; NaN: that of the calibration."""
     variance_m2: Floats
     gravity: Floats
     """Intervals of gravity: velocity of the IMU's point at both ends, duration, and sigma of the tilt, shape (g, 8)."""
@@ -164,37 +167,40 @@ class Events(NamedTuple):
 
 @compiled
 def in_order(
-    epochs_ns: Ints, reached_ns: Ints, depth_ns: Ints, seen_ns: Ints, outcome: NDArray[np.int8], since_ns: int,
+    epochs_ns: Ints, reached_ns: Ints, samples: Ints, seen_ns: Ints, outcome: NDArray[np.int8], since_ns: int,
     end_ns: int, node_ns: int, opened_ns: int, interval_ns: int, is_planar: bool, out: Ints,
 ) -> int:  # fmt: skip
     """Write the first five columns of `Events` into the rows of ``out``, up to the end of a call; their number.
 
     Parameters
     ----------
+    samples
+        Stamps, kinds and rows of depths, headings and fixes, in order, shape (3, s).
     since_ns
-        Depth samples stamped earlier are passed over, and detections that are not accepted.
+        Samples stamped earlier are passed over, and detections that are not accepted.
     node_ns, opened_ns, interval_ns
         Epochs of the state and at which the interval of gravity began, and its least length; 0: no gravity.
     """
-    n, e, d, r, g, kind, stamp_ns, frame_ns = 0, 0, 0, 0, 0, END, LONG_AGO, LONG_AGO
+    n, e, s, r, g, kind, stamp_ns, frame_ns = 0, 0, 0, 0, 0, END, LONG_AGO, LONG_AGO
+    sample_ns = samples[0]
     while n == 0 or kind != END:
         if kind == EPOCH and is_planar:
             kind, until_ns = PLANE, node_ns
         elif kind <= PLANE and 0 < interval_ns <= node_ns - opened_ns:
             kind, until_ns, opened_ns, row, g = GRAVITY, node_ns, node_ns, g, g + 1
         else:
-            while d < len(depth_ns) and depth_ns[d] < since_ns:
-                d += 1
+            while s < len(sample_ns) and sample_ns[s] < since_ns:
+                s += 1
             while r < len(seen_ns) and (seen_ns[r] == frame_ns or outcome[r] != ACCEPTED):
                 r += 1
             stamp_ns, until_ns, kind, row = end_ns, end_ns, END, 0
             if r < len(seen_ns):
                 stamp_ns, until_ns, kind, row = seen_ns[r], seen_ns[r], FRAME, r
-            if d < len(depth_ns) and depth_ns[d] <= stamp_ns:
-                stamp_ns, until_ns, kind, row = depth_ns[d], depth_ns[d], DEPTH, d
+            if s < len(sample_ns) and sample_ns[s] <= stamp_ns:
+                stamp_ns, until_ns, kind, row = sample_ns[s], sample_ns[s], samples[1, s], samples[2, s]
             if e < len(epochs_ns) and reached_ns[e] <= stamp_ns:
                 stamp_ns, until_ns, kind, row = reached_ns[e], epochs_ns[e], EPOCH, e
-            e, d = e + int(kind == EPOCH), d + int(kind == DEPTH)
+            e, s = e + int(kind == EPOCH), s + int(DEPTH <= kind <= FIX)
             frame_ns = stamp_ns if kind == FRAME else frame_ns
         out[0, n], out[1, n], out[2, n], out[3, n], out[4, n] = stamp_ns, node_ns, until_ns, kind, row
         node_ns, n = until_ns if kind == EPOCH else node_ns, n + 1
@@ -371,10 +377,12 @@ def far_view(
 # ------------------------------------------------------------------------------------------------- the shell
 
 NO_BIAS, NO_STAMPS, NO_DEPTH, NO_GRAVITY = np.zeros(3), np.empty(0, np.int64), np.empty(0), np.empty((0, 8))
+NO_SAMPLES = np.empty((3, 0), np.int64)
 NO_PAIRS, NO_COV = np.empty((0, 2)), np.empty((0, 2, 2))
 NO_VIEWS = Views(NO_STAMPS, NO_STAMPS, NO_PAIRS, NO_COV, np.empty(0, np.int8), NO_PAIRS, NO_COV)
-KEPT_NS = 10_000_000_000
-"""Rows of this time may be kept longer than needed: dropping them costs as much as keeping a few."""
+KEPT_NS = 20_000_000_000
+"""Age of a position fix up to which rows for it are kept: the smoother's window by default. Up to twice as many are
+kept, since dropping them costs as much as keeping a few."""
 
 
 class FilterShell(ABC):
@@ -400,6 +408,7 @@ class FilterShell(ABC):
         self._was_lost = False
         self._slots: dict[int, int] = {}
         self._journal, self._estimates = DetectionJournal(), CausalEstimates()
+        self._refused: list[RefusedRow] = []
 
     # ---------------------------------------------------------------- mathematics of a filter
 
@@ -413,6 +422,14 @@ class FilterShell(ABC):
     @abstractmethod
     def correct_plane(self, plane: PlanarMotion) -> None:
         """Update by the plane on which the vehicle stays."""
+
+    @abstractmethod
+    def correct_heading(self, motion: Motion, yaw_rad: float, variance_rad2: float) -> None:
+        """Update by the yaw of the body and the compass' bias, a motion after the state; robust (`doubted`)."""
+
+    @abstractmethod
+    def correct_position(self, motion: Motion, point: Floats, position_m: Floats, cov_m2: Floats) -> None:
+        """Update by the world position of a point of the body (3,), a motion after the state; robust (`doubted`)."""
 
     @abstractmethod
     def observe(
@@ -467,15 +484,16 @@ class FilterShell(ABC):
         since_ns, self._done_ns = max(self._done_ns, self._reached_ns), max(self._done_ns, end_ns)
         ids, views = self._views(detections, since_ns)
         estimate = None
-        if end_ns >= max(self._reached_ns, self.node_ns):
-            try:
-                estimate = self._use(end_ns, depth, since_ns, ids, views)
-            except np.linalg.LinAlgError as error:
-                raise EstimatorError(
-                    f"{self.name}: between {self.node_ns} and {end_ns} ns the expected covariance of a measurement is"
-                    " not positive definite; give variances above zero in log and calibration"
-                ) from error
-            self._estimates.keep(estimate)
+        try:
+            samples = self._samples(measurements, depth, since_ns)
+            if end_ns >= max(self._reached_ns, self.node_ns):
+                estimate = self._use(end_ns, samples, since_ns, ids, views)
+                self._estimates.keep(estimate)
+        except np.linalg.LinAlgError as error:
+            raise EstimatorError(
+                f"{self.name}: between {self.node_ns} and {end_ns} ns the expected covariance of a measurement is"
+                " not positive definite; give variances above zero in log and calibration"
+            ) from error
         if detections is not None:
             self._journal.extend(detections.stamps_ns, ids, views.outcome, views.e, views.S)
         return estimate
@@ -513,8 +531,8 @@ class FilterShell(ABC):
         ]
 
     def refused_rows(self) -> list[RefusedRow]:
-        """Rows of IMU, Doppler log and depth that are not used, with the reason."""
-        return self.odometry.refused
+        """Rows of all sensors but the sonar that are not used, with the reason."""
+        return self.odometry.refused + self._refused
 
     # ---------------------------------------------------------------- events
 
@@ -544,9 +562,56 @@ class FilterShell(ABC):
         e[:] = S[:] = math.nan
         return ids, Views(stamps_ns, landmark, z, R_z, outcome, e, S)
 
-    def _use(self, end_ns: int, depth: Depth | None, since_ns: int, ids: Ints, views: Views) -> Estimate:
+    def _samples(self, measurements: Measurements, depth: Depth | None, since_ns: int) -> dict[int, Any]:
+        """Samples of a call, a block for each kind. Unsound rows and late headings are refused; a late fix is used."""
+        samples: dict[int, Any] = {} if depth is None else {DEPTH: depth}
+        heading, fixes = measurements.heading, measurements.positions
+        aiding: list[tuple[int, str, Any]] = [(HEADING, "heading", heading), (FIX, "positions", fixes)]
+        for kind, sensor, block in aiding:
+            if block is None:
+                continue
+            is_sound, is_late = block.are_sound(), block.stamps_ns < since_ns
+            for row in np.flatnonzero(~is_sound | is_late).tolist():
+                if not (is_sound[row] and kind == FIX and self._use_late(block, row, since_ns)):
+                    reason = Refusal.LATE if is_sound[row] else Refusal.UNSOUND
+                    self._refused.append(RefusedRow(sensor, int(block.stamps_ns[row]), reason, math.nan))
+            if (is_used := is_sound & ~is_late).any():
+                samples[kind] = block.rows(is_used)
+        return samples
+
+    def _use_late(self, fixes: PositionFixes, row: int, since_ns: int) -> bool:
+        """Update by a fix of an earlier instant i, by the motion backwards; False where rows of its time are gone.
+
+        From epoch j the antenna was then at ``j_T_i l``, with covariance ``Ad(i_T_j) C Ad(i_T_j)^T``. The state
+        shares the error of this motion, which is left out: the fix tells rather too little.
+        """
+        stamp_ns, node_ns = int(fixes.stamps_ns[row]), self.node_ns
+        if stamp_ns < max(self._reached_ns, node_ns - KEPT_NS):
+            return False
+        first_ns, last_ns = min(stamp_ns, node_ns), max(stamp_ns, node_ns)
+        between = self.odometry.motion(first_ns, last_ns, self.gyro_bias(), self.attitude(), since_ns)
+        T, C, D = between.i_T_j, between.covariance, between.D_bias
+        if stamp_ns < node_ns:
+            A = T.AdjointMap()
+            T, C, D = T.inverse(), A @ C @ A.T, -A @ D
+        self._fix(Motion(np.ascontiguousarray(T.rotation().matrix()), T.translation(), C, D, NO_BIAS), fixes, row)
+        return True
+
+    def _fix(self, motion: Motion, fixes: PositionFixes, row: int) -> None:
+        """Update by a position fix, with the calibration's noise where it has none."""
+        cov_m2, known = fixes.covariance_m2[row], self.calibration.positions
+        cov_m2 = np.diag(np.square(known.sigma_m)) if np.isnan(cov_m2).any() else cov_m2
+        self.correct_position(motion, np.array(known.antenna_m), fixes.position_m[row], cov_m2)
+
+    def _turn(self, motion: Motion, heading: Heading, row: int) -> None:
+        """Update by a heading, with the calibration's noise where it has none."""
+        sigma_rad = float(heading.sigma_rad[row])
+        sigma_rad = self.calibration.heading.sigma_rad if math.isnan(sigma_rad) else sigma_rad
+        self.correct_heading(motion, float(heading.yaw_rad[row]), sigma_rad**2)
+
+    def _use(self, end_ns: int, samples: dict[int, Any], since_ns: int, ids: Ints, views: Views) -> Estimate:
         """Carry the state to the newest epoch reached at the end of the call, with all measurements on the way."""
-        events = self._events(end_ns, depth, since_ns, views)
+        events = self._events(end_ns, samples, since_ns, views)
         kinds, k = events.kind.tolist(), 0
         while kinds[k] != END:
             if kinds[k] == PLANE and self._plane is not None:
@@ -558,9 +623,15 @@ class FilterShell(ABC):
                 if used_until > k:
                     k = used_until
                     continue
-                if kinds[k] != FRAME:
+                motion, row = self.motion_to(events, k), int(events.row[k])
+                if kinds[k] == FRAME:
+                    self._see(ids, motion, views, row)
+                elif kinds[k] == HEADING:
+                    self._turn(motion, samples[HEADING], row)
+                elif kinds[k] == FIX:
+                    self._fix(motion, samples[FIX], row)
+                else:
                     raise EstimatorError(f"{self.name}: the motion to {events.end_ns[k]} ns over a gap is not finite")
-                self._see(ids, self.motion_to(events, k), views, int(events.row[k]))
             k += 1
         if math.isnan(events.dp[k, 0]):
             self._bridge(events, k)
@@ -568,19 +639,22 @@ class FilterShell(ABC):
         R, X, covariance = self.pose_after(self.motion_to(events, k))
         self.odometry.settle(self.node_ns)
         if self.node_ns > self._kept_ns + KEPT_NS:
-            self.odometry.forget_before(self.node_ns)
+            self.odometry.forget_before(self.node_ns - KEPT_NS)
             self._kept_ns = self.node_ns
         return Estimate(end_ns, gtsam.Pose3(gtsam.Rot3(R), X), covariance)
 
-    def _events(self, end_ns: int, depth: Depth | None, since_ns: int, views: Views) -> Events:
+    def _events(self, end_ns: int, samples: dict[int, Any], since_ns: int, views: Views) -> Events:
         """What happens up to the end of a call, from the state's epoch on."""
         epochs_ns, reached_ns = self.odometry.epochs_reached(self.node_ns, end_ns)
-        depth_ns, z_m, variance_m2 = NO_STAMPS, NO_DEPTH, NO_DEPTH
-        if depth is not None:
-            depth_ns, z_m, variance_m2 = depth.stamps_ns, depth.z_m, depth.variance_m2
-        columns = np.empty((5, 3 * len(epochs_ns) + len(depth_ns) + len(views.stamp_ns) + 1), np.int64)
+        depth, ordered = samples.get(DEPTH), NO_SAMPLES
+        z_m, variance_m2 = (NO_DEPTH, NO_DEPTH) if depth is None else (depth.z_m, depth.variance_m2)
+        if samples:
+            rows = [(block.stamps_ns, [kind] * len(block), range(len(block))) for kind, block in samples.items()]
+            ordered = np.concatenate([np.array(columns) for columns in rows], axis=1)
+            ordered = np.take(ordered, np.argsort(ordered[0], kind="stable"), axis=1)
+        columns = np.empty((5, 3 * len(epochs_ns) + ordered.shape[1] + len(views.stamp_ns) + 1), np.int64)
         n = in_order(
-            epochs_ns, reached_ns, depth_ns, views.stamp_ns, views.outcome, since_ns, end_ns,
+            epochs_ns, reached_ns, ordered, views.stamp_ns, views.outcome, since_ns, end_ns,
             self.node_ns, self._opened_ns, self._interval_ns, self._plane is not None, columns,
         )  # fmt: skip
         stamp_ns, start_ns, until_ns, kind, row = columns[:, :n]
@@ -623,8 +697,8 @@ class FilterShell(ABC):
         C, D = over.covariance.copy(), over.D_bias
         if not self.has_bias:
             C[3:, 3:] += self.calibration.imu.gyro_bias_sigma**2 * D[3:] @ D[3:].T
-        if kind in (DEPTH, FRAME):
-            more = 1 if kind == DEPTH else len(accepted_rows(events.seen_ns, events.outcome, row))
+        if DEPTH <= kind <= FRAME:
+            more = len(accepted_rows(events.seen_ns, events.outcome, row)) if kind == FRAME else 1
             self._in_gap[start_ns, kind] = count = self._in_gap.get((start_ns, kind), 0) + more
             C *= count * (count + 1)
         events.has_rate[k] = False

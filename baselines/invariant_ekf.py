@@ -28,7 +28,7 @@ from baselines.invariant_equations import BARE, BETA, BODY, EYE, THETA, UP, Inva
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
 from sonar_graph.measurements import Floats
 from sonar_graph.motion import BIASES, MotionSource, bias_sigmas, gyro_bias_of
-from sonar_graph.slam.models import FLOOR_GATE, wrap_angle
+from sonar_graph.slam.models import FLOOR_GATE, doubted, wrap_angle
 
 
 class InvariantEkfParams(FilterParams):
@@ -133,9 +133,25 @@ class InvariantEkf(FilterShell):
 
     def correct_depth(self, motion: Motion, z_m: float, variance_m2: float) -> None:
         """Update by the height of the pressure port a motion after the state, (7)."""
-        height_m, H, H_m = equations.height_of_body_point(self._state, motion, self.port)
+        position_m, H, H_m = (part[2:] for part in equations.position_of_body_point(self._state, motion, self.port))
         HP, S = equations.innovation_covariance(self._state, H, H_m @ motion.C @ H_m.T + variance_m2)
-        equations.correct(self._state, HP, S, np.array([z_m - height_m]))
+        equations.correct(self._state, HP, S, z_m - position_m)
+
+    def correct_heading(self, motion: Motion, yaw_rad: float, variance_rad2: float) -> None:
+        """Update by the yaw of the body and the compass' bias a motion after the state, (10)."""
+        predicted, H, H_m = equations.yaw_of_compass(self._state, motion)
+        e = np.array([wrap_angle(yaw_rad - predicted)])
+        self.correct_robustly(motion, H, H_m, e, np.array([[variance_rad2]]))
+
+    def correct_position(self, motion: Motion, point: Floats, position_m: Floats, cov_m2: Floats) -> None:
+        """Update by the position of a point of the body a motion after the state, (7)."""
+        predicted, H, H_m = equations.position_of_body_point(self._state, motion, point)
+        self.correct_robustly(motion, H, H_m, position_m - predicted, cov_m2)
+
+    def correct_robustly(self, motion: Motion, H: Floats, H_m: Floats, e: Floats, R_z: Floats) -> None:
+        """Update by measurements of which some are outliers, (9)."""
+        HP, S = equations.innovation_covariance(self._state, H, H_m @ motion.C @ H_m.T + R_z)
+        equations.correct(self._state, HP, doubted(e, S, R_z), e)
 
     def observe(
         self, motion: Motion, slot: int, z: Floats, R_z: Floats, *, may_be_far: bool

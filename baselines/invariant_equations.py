@@ -25,9 +25,9 @@ New landmark at ``x = X' + R' q(z)``, q the point of the body that is seen at z 
 
     xi_new = xi_0 + R' Q(q) eps + R' (dq / dz) dz                                                              (6)
 
-Height of ``a = X' + R' q``, k = 0, or of a landmark ``a = x_k``, of which H_m is zero::
+Position of ``a = X' + R' q``, k = 0, or of a landmark ``a = x_k``, of which H_m is zero; heights are their last rows::
 
-    H_theta = (a x e_z)^T,    H_xi_k = e_z^T,    H_m = e_z^T R' Q(q)                                           (7)
+    H_theta = -[a]x,    H_xi_k = I,    H_m = R' Q(q)                                                           (7)
 
 Direction u of the world's up in the body, tilted by A times the bias a of the accelerometers, and the innovation
 covariance::
@@ -35,8 +35,12 @@ covariance::
     y = (R (u - A a))_xy = [ -theta_y, theta_x ] + (R A beta_a)_xy + noise                                     (8)
     S = H P H^T + H_m C H_m^T + R_z                                                                            (9)
 
-Every H is zero along a shift of everything in x and y and a turn about the vertical, at any estimate, so these
-unobservable directions stay unobservable. Derivation: docs/theory/invariant_ekf.md.
+Compass, with the derivative h of the yaw by a turn in the body, and its bias c in b::
+
+    psi' + c,    H_theta = h R'^T,    H_c = 1,    H_m = [h 0]                                                 (10)
+
+Every H but those of compass and position fixes is zero along a shift of everything in x and y and a turn about the
+vertical, at any estimate, so these unobservable directions stay unobservable. Derivation: docs/theory/invariant_ekf.md.
 """
 
 from dataclasses import dataclass, field
@@ -45,9 +49,9 @@ import numpy as np
 
 from baselines.filter import Motion, SonarModel, correction
 from sonar_graph.measurements import Floats
-from sonar_graph.motion import ACCEL, BIASES, SCALE, by_biases
+from sonar_graph.motion import ACCEL, BIASES, COMPASS, SCALE, by_biases
 from sonar_graph.numerics import compiled, exp_and_mean, store, vec
-from sonar_graph.slam.models import project, sonar_point, sonar_point_jacobian
+from sonar_graph.slam.models import project, sonar_point, sonar_point_jacobian, yaw_and_derivative
 
 THETA, BETA, BODY = slice(0, 3), slice(3, 3 + BIASES), slice(3 + BIASES, 6 + BIASES)
 """Places of theta, beta and xi_0 in xi."""
@@ -80,7 +84,7 @@ class InvariantState:
         return self.R[2] if self.is_levelled else np.zeros(3)
 
     def D(self, motion: Motion) -> Floats:
-        """Derivative of a motion from the state by the biases, shape (6, 9)."""
+        """Derivative of a motion from the state by the biases, shape (6, 11)."""
         return by_biases(motion.D, motion.dR, motion.dp, self.up(), self.body_p_dvl)
 
 
@@ -161,7 +165,7 @@ def Q(q: Floats) -> Floats:
 
 
 def observation(state: InvariantState, k: int, motion: Motion, sonar: SonarModel) -> tuple[Floats, Floats, Floats]:
-    """Range and azimuth of landmark k, shape (2,), H (2, 9 + 3 N) and H_m (2, 6) of (5)."""
+    """Range and azimuth of landmark k, shape (2,), H (2, 17 + 3 N) and H_m (2, 6) of (5)."""
     R, X = pose(state, motion)
     q = R.T @ (state.points[k] - X)
     z, D_q = project(sonar.body_R_sonar.T @ (q - sonar.body_p_sonar))
@@ -177,7 +181,7 @@ def location(
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """The point that is seen at range and azimuth z, and the derivatives of its xi by (6).
 
-    Returns the point (3,); G by xi, shape (3, 9 + 3 N); G_m by the motion, shape (3, 6); G_z by range, azimuth and
+    Returns the point (3,); G by xi, shape (3, 17 + 3 N); G_m by the motion, shape (3, 6); G_z by range, azimuth and
     elevation, shape (3, 3).
     """
     R, X = pose(state, motion)
@@ -188,25 +192,36 @@ def location(
     return X + R @ q, G, G_m, R @ sonar.body_R_sonar @ sonar_point_jacobian(z[0], z[1], elevation_rad)
 
 
-def height_of_body_point(state: InvariantState, motion: Motion, q: Floats) -> tuple[float, Floats, Floats]:
-    """Height of point q of the body, H (1, 9 + 3 N) and H_m (1, 6) of (7)."""
+def position_of_body_point(state: InvariantState, motion: Motion, q: Floats) -> tuple[Floats, Floats, Floats]:
+    """Position of point q of the body, shape (3,), H (3, 17 + 3 N) and H_m (3, 6) of (7)."""
     R, X = pose(state, motion)
     a = X + R @ q
-    H, H_m = np.zeros((1, len(state.P))), R[2:] @ Q(q)
-    H[0, THETA], H[0, BODY] = (a[1], -a[0], 0.0), UP  # a x e_z
+    H, H_m = np.zeros((3, len(state.P))), R @ Q(q)
+    H[:, THETA], H[:, BODY] = -hat(a), EYE
     H[:, BETA] = H_m @ state.D(motion)  # (4)
-    return a[2], H, H_m
+    return a, H, H_m
+
+
+def yaw_of_compass(state: InvariantState, motion: Motion) -> tuple[float, Floats, Floats]:
+    """Yaw of the body and bias of the compass, H (1, 17 + 3 N) and H_m (1, 6) of (10)."""
+    R, _ = pose(state, motion)
+    yaw_rad, by_turn = yaw_and_derivative(R)
+    H, H_m = np.zeros((1, len(state.P))), np.zeros((1, 6))
+    H[0, THETA], H_m[0, :3] = R @ by_turn, by_turn
+    H[:, BETA] = H_m @ state.D(motion)  # (4)
+    H[0, BETA.start + COMPASS] = 1.0
+    return yaw_rad + state.bias[COMPASS], H, H_m
 
 
 def height_of_point(state: InvariantState, k: int) -> tuple[float, Floats]:
-    """Height of x_k and H (1, 9 + 3 N) of (7)."""
+    """Height of x_k and H (1, 17 + 3 N) of (7)."""
     H, a = np.zeros((1, len(state.P))), state.points[k]
     H[0, THETA], H[0, place_of(k)] = (a[1], -a[0], 0.0), UP
     return a[2], H
 
 
 def up_innovation(state: InvariantState, up: Floats, by_accel: Floats) -> tuple[Floats, Floats]:
-    """Innovation y (2,) and H (2, 15 + 3 N) of (8); ``by_accel``: A, shape (3, 3)."""
+    """Innovation y (2,) and H (2, 17 + 3 N) of (8); ``by_accel``: A, shape (3, 3)."""
     H, by_bias = np.zeros((2, len(state.P))), state.R @ by_accel
     H[:, :2] = (0.0, -1.0), (1.0, 0.0)
     H[:, BETA][:, ACCEL] = by_bias[:2]

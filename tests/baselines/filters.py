@@ -127,31 +127,34 @@ def random_covariance(n: int, scale: float = 0.03, seed: int = 0) -> Floats:
 
 
 class Ekf:
-    """EKF-SLAM; its error is a difference of the state's numbers, of which it has no bias."""
+    """EKF-SLAM; its error is a difference of the state's numbers, whose only bias is that of the compass."""
 
-    kind, bare = EkfSlam, 6
+    kind, bare = EkfSlam, 7
 
     @staticmethod
     def begin(slam: Any, world: World, P: Floats) -> None:
-        slam._x = np.concatenate([world.X, gtsam.Rot3(world.R).rpy(), world.landmarks.ravel()])
+        slam._x = np.concatenate([world.X, gtsam.Rot3(world.R).rpy(), world.bias[9:10], world.landmarks.ravel()])
         slam._P = P.copy()
 
     @staticmethod
     def estimate(slam: Any) -> tuple[World, Floats]:
         _, x, P = slam.state()
-        return World(gtsam.Rot3.RzRyRx(x[3:6]).matrix(), x[:3], x[6:].reshape(-1, 3)), P
+        bias = np.concatenate([BIAS[:9], x[6:7], BIAS[10:]])
+        return World(gtsam.Rot3.RzRyRx(x[3:6]).matrix(), x[:3], x[7:].reshape(-1, 3), bias), P
 
     @staticmethod
     def moved(world: World, xi: Floats) -> World:
         """The world whose error against the given one is xi."""
         angles = gtsam.Rot3(world.R).rpy() + xi[3:6]
-        return World(gtsam.Rot3.RzRyRx(angles).matrix(), world.X + xi[:3], world.landmarks + xi[6:].reshape(-1, 3))
+        R, bias = gtsam.Rot3.RzRyRx(angles).matrix(), world.bias + xi[6] * np.eye(11)[9]
+        return World(R, world.X + xi[:3], world.landmarks + xi[7:].reshape(-1, 3), bias)
 
     @staticmethod
     def error(true: World, estimate: World) -> Floats:
         turn = gtsam.Rot3(true.R).rpy() - gtsam.Rot3(estimate.R).rpy()
         turn = [math.remainder(angle, 2 * math.pi) for angle in turn]
-        return np.concatenate([true.X - estimate.X, turn, (true.landmarks - estimate.landmarks).ravel()])
+        compass = (true.bias - estimate.bias)[9:10]
+        return np.concatenate([true.X - estimate.X, turn, compass, (true.landmarks - estimate.landmarks).ravel()])
 
 
 class Invariant:

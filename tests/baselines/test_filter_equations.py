@@ -21,6 +21,7 @@ from .filters import (
     NOISE,
     NOTHING,
     PORT,
+    STILL,
     Ekf,
     Invariant,
     attitudes,
@@ -108,7 +109,7 @@ def in_view(angles, motion, view):
 
 @both
 @given(attitudes, twists, views)
-def test_updates_by_a_detection_and_by_depth_are_the_textbook_s(filter_, angles, twist, view):
+def test_updates_by_detection_depth_heading_and_fix_are_the_textbook_s(filter_, angles, twist, view):
     """With numerical derivatives; the log's noise is correlated."""
     motion, e, R_z = motion_of(twist, C), np.array([0.01, -0.005]), np.array([[4e-4, 1e-4], [1e-4, 1e-4]])
     world = in_view(angles, motion, view)
@@ -128,6 +129,32 @@ def test_updates_by_a_detection_and_by_depth_are_the_textbook_s(filter_, angles,
     H, H_m = numerical(height, filter_, world)
     correct_depth(slam, motion, height(world, NOTHING)[0] + 0.02, 3e-4)
     assert_corrected(filter_, slam, world, P, H, H_m @ C @ H_m.T + 3e-4, np.array([0.02]))
+
+    assume(abs(pose_after(world, motion).rotation().pitch()) < 1.4)
+    compass = lambda true, eps: np.array([pose_after(true, motion, eps).rotation().yaw() + true.bias[9]])  # noqa: E731
+    H, H_m = numerical(compass, filter_, world, [0])
+    slam, e = begun(filter_, world), np.array([-0.01])
+    slam.correct_heading(motion, compass(world, NOTHING)[0] + e[0] - 2 * np.pi, 3e-4)
+    assert_corrected(filter_, slam, world, P, H, H_m @ C @ H_m.T + 3e-4, e)
+
+    antenna = lambda true, eps: pose_after(true, motion, eps).transformFrom(-2.0 * PORT)  # noqa: E731
+    H, H_m = numerical(antenna, filter_, world)
+    slam, e, R_z = begun(filter_, world), np.array([0.01, -0.02, 0.03]), random_covariance(3, 0.05) + 1e-3 * np.eye(3)
+    slam.correct_position(motion, -2.0 * PORT, antenna(world, NOTHING) + e, R_z)
+    assert_corrected(filter_, slam, world, P, H, H_m @ C @ H_m.T + R_z, e)
+
+
+@both
+def test_an_outlying_fix_has_the_kernel_s_noise(filter_):
+    """Ten standard deviations S off, ``R`` is ``10 / 1.345 R``; 1.3 off it is R."""
+    world, R_z = world_at(ANGLES), np.diag([0.04, 0.09, 0.25])
+    _, P = filter_.estimate(begun(filter_, world))
+    H, _ = numerical(lambda true, eps: pose_after(true, STILL, eps).translation(), filter_, world)
+    for deviations, times in ((1.3, 1.0), (10.0, 10.0 / 1.345)):
+        slam, e = begun(filter_, world), np.zeros(3)
+        e[0] = deviations / np.sqrt(np.linalg.inv(H @ P @ H.T + R_z)[0, 0])
+        slam.correct_position(STILL, np.zeros(3), world.X + e, R_z)
+        assert_corrected(filter_, slam, world, P, H, times * R_z, e)
 
 
 @both
@@ -215,7 +242,7 @@ def test_an_error_moves_the_estimate_by_the_group_s_exponential(angles, turn):
 
 @given(attitudes, twists, views, st.floats(-np.pi, np.pi))
 def test_every_jacobian_is_the_numerical_one(angles, twist, view, turn):
-    """Of view, point seen, height and up: by xi and by the motion. The direction of up is the true one."""
+    """Of view, point seen, position, heading, height and up: by xi and motion. The direction of up is the true one."""
     motion = motion_of(twist, C)
     world, sonar = in_view(angles, motion, view), SonarModel.of(CALIBRATION, FilterParams())
     state = Invariant.state(world, np.eye(23))
@@ -238,8 +265,11 @@ def test_every_jacobian_is_the_numerical_one(angles, twist, view, turn):
     assert_allclose(x, world.landmarks[1], atol=1e-12)
     check(G, G_m, located)
     check_derivative(lambda off: located(world, NOTHING, off), G_z, np.zeros(3))
-    _, H, H_m = invariant_equations.height_of_body_point(state, motion, PORT)
-    check(H, H_m, lambda true, eps: pose_after(true, motion, eps).transformFrom(PORT)[2:])
+    _, H, H_m = invariant_equations.position_of_body_point(state, motion, PORT)
+    check(H, H_m, lambda true, eps: pose_after(true, motion, eps).transformFrom(PORT))
+    assume(abs(pose_after(world, motion).rotation().pitch()) < 1.4)
+    _, H, H_m = invariant_equations.yaw_of_compass(state, motion)
+    check(H, H_m, lambda true, eps: [pose_after(true, motion, eps).rotation().yaw() + true.bias[9]], [0])
     for k in range(3):
         _, H = invariant_equations.height_of_point(state, k)
         check(H, np.zeros((1, 6)), lambda true, _, k=k: np.vstack([true.X, true.landmarks])[k, 2:])
@@ -291,7 +321,7 @@ def test_no_measurement_tells_where_the_world_is_or_which_way_it_is_turned(angle
     H = np.vstack(
         [
             invariant_equations.observation(state, 2, motion, sonar)[1],
-            invariant_equations.height_of_body_point(state, motion, PORT)[1],
+            invariant_equations.position_of_body_point(state, motion, PORT)[1][2:],
             *(invariant_equations.height_of_point(state, k)[1] for k in range(3)),
             invariant_equations.up_innovation(state, np.array([0.1, 0.2, 0.9]), np.eye(3) / 9.8)[1],
         ]

@@ -50,3 +50,4 @@ def test_headings_and_fixes_that_an_estimator_never_asks_for_are_named(monkeypat
     fixes = "positions: none of its 21 rows is used; this estimator takes no positions"
     assert run_estimator(world, "dead-reckoning").withheld == [fixes]
     assert run_estimator(unaided, "dead-reckoning").withheld == []
+    assert [run_estimator(world, name).withheld for name in ("ekf-slam", "invariant-ekf", "isam2")] == [[]] * 3

@@ -27,6 +27,7 @@ from sonar_graph.measurements import Floats
 from sonar_graph.motion import ACCEL, COMPASS
 from sonar_graph.navigation import PreintegratedMotion
 from sonar_graph.numerics import cross_matrix
+from sonar_graph.slam.models.aiding import HUBER_WIDTH, yaw_and_derivative
 from sonar_graph.slam.models.kernels import Robust
 from sonar_graph.slam.models.sonar_model import wrap_angle
 from sonar_graph.slam.models.views import range_azimuth_jacobians
@@ -36,9 +37,6 @@ UNINFORMATIVE_RAD = 1e3
 """Sigmas that leave a direction to the other factors."""
 EXACT, STEADY = 1e-9, 1e-3
 """Sigma of a bias (rad/s, m/s²) that is zero; share of its sigma by which one without a walk may walk in a stretch."""
-HUBER_WIDTH = 1.345
-"""Of the kernel of headings and position fixes, in standard deviations: 95 % efficient for Gaussian noise. It is
-convex: a start that is far off finds its way, which a kernel that lets go of large errors does not promise."""
 CORRELATION_LIMIT = 1e-6
 """Above it, range and azimuth noise are taken together."""
 EQUIDISTANT = gtsam.Cal3Fisheye(1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -276,14 +274,12 @@ def heading(
     """Yaw of the body and the compass' bias add up to what is measured: ``atan2(R_yx, R_xx) + b_compass - yaw``."""
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:
-        R, b = values.atPose3(pose_key).rotation().matrix(), values.atVector(bias_key)
-        (x, a, c), (y, b_y, d) = R[0].tolist(), R[1].tolist()
+        b = values.atVector(bias_key)
+        predicted, by_turn = yaw_and_derivative(values.atPose3(pose_key).rotation().matrix())
         if jacobians is not None:
-            level2 = x * x + y * y
             jacobians[0], jacobians[1] = np.zeros((1, 6)), np.zeros((1, len(b)))
-            jacobians[0][0, 1:3] = (y * c - x * d) / level2, (x * b_y - y * a) / level2
-            jacobians[1][0, COMPASS] = 1.0
-        return np.array([wrap_angle(math.atan2(y, x) + b[COMPASS] - yaw_rad)])
+            jacobians[0][0, :3], jacobians[1][0, COMPASS] = by_turn, 1.0
+        return np.array([wrap_angle(predicted + b[COMPASS] - yaw_rad)])
 
     noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma_rad)
     return gtsam.CustomFactor(robust(noise), [pose_key, bias_key], error)
