@@ -15,7 +15,7 @@ import numpy as np
 from gtsam.symbol_shorthand import X
 
 from sonar_graph.navigation import PreintegratedMotion
-from sonar_graph.slam.smoother import JointCovariance
+from sonar_graph.slam.smoother import JointCovariance, Marginals
 from sonar_graph.states import Estimate, Trajectory
 
 TRIANGLE = np.tril_indices(6)
@@ -89,7 +89,7 @@ class PoseHistory:
         count = bisect_left(self._stamps_ns, stamp_ns)
         del self._stamps_ns[:count], self._poses[: 7 * count], self._triangles[: 21 * count]
 
-    def trajectory(self, values: gtsam.Values, marginals: gtsam.Marginals | gtsam.ISAM2) -> Trajectory:
+    def trajectory(self, values: gtsam.Values, marginals: Marginals) -> Trajectory:
         """Poses at all instants."""
         rest = Trajectory.from_estimates(_estimates(self._open, values, marginals))
         n = len(self._stamps_ns)
@@ -108,7 +108,7 @@ class PoseHistory:
 
 
 def _estimates(
-    instants: list[AnchoredPose], values: gtsam.Values, marginals: gtsam.Marginals | gtsam.ISAM2
+    instants: list[AnchoredPose], values: gtsam.Values, marginals: Marginals | gtsam.ISAM2
 ) -> list[Estimate]:
     estimates = []
     for _, on_one in groupby(instants, key=lambda instant: instant.keyframe):
@@ -122,6 +122,6 @@ class Solution(NamedTuple):
     """Solution of the whole graph."""
 
     values: gtsam.Values
-    marginals: gtsam.Marginals | gtsam.ISAM2
+    marginals: Marginals
     ids: list[int]
     """Landmarks in it, ascending."""

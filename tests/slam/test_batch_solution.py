@@ -7,7 +7,7 @@ from gtsam.symbol_shorthand import L, X
 
 from sonar_graph.slam.models import factors
 from sonar_graph.slam.smoother import Smoother
-from sonar_graph.slam.smoother.batch_solution import Sightline, Sightlines, placed_anew, solve, turned_away
+from sonar_graph.slam.smoother.batch_solution import Marginals, Sightline, Sightlines, placed_anew, solve, turned_away
 
 from .fed import FOREVER_S, SONAR, in_the_basin
 from .graphs import gtsams_solution
@@ -53,6 +53,57 @@ def test_where_nothing_lowers_the_error_the_initial_values_are_returned():
     initial = values_of(L0=np.ones(3))
     graph = graph_of([gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(3), [L(0)], unwise)])
     assert solve(graph, initial).equals(initial, 0.0)
+
+
+def after_a_lost_heading() -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """Two keyframes that know each other's heading to 2e-5 rad, after a turn known to 0.2 rad."""
+    step, places = gtsam.Pose3(gtsam.Rot3.Yaw(0.2), np.array([1.0, 0.1, 0.05])), {0: (4, 1, 0.5), 1: (4, -1, 0.3)}
+    poses = [gtsam.Pose3(), step, step.compose(step)]
+    graph, values = graph_of([pose_prior(X(0), poses[0], 0.01)]), gtsam.Values()
+    for k, (turn_rad, way_m) in enumerate([(0.2, 0.2), (2e-5, 0.01)]):
+        noise = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([turn_rad, way_m], 3))
+        graph.add(gtsam.BetweenFactorPose3(X(k), X(k + 1), step, noise))
+    for k, pose in enumerate(poses):
+        values.insert(X(k), pose)
+    for landmark, place in places.items():
+        values.insert(L(landmark), np.array(place, dtype=float))
+        for k in (1, 2):
+            seen_at, noise = poses[k].transformTo(values.atPoint3(L(landmark))), gtsam.noiseModel.Isotropic
+            z = gtsam.Unit3(seen_at), float(np.linalg.norm(seen_at))
+            graph.add(gtsam.BearingRangeFactor3D(X(k), L(landmark), *z, noise.Sigma(3, 0.03)))
+    return graph, values
+
+
+def test_marginals_that_cholesky_refuses_when_asked_are_those_of_the_whole_information_matrix():
+    graph, values = after_a_lost_heading()
+    ordering = gtsam.Ordering.ColamdGaussianFactorGraph(graph.linearize(values))
+    A, _ = graph.linearize(values).jacobian(ordering)
+    scale = 1.0 / np.linalg.norm(A, axis=0)
+    inverse = np.linalg.pinv(A * scale) * scale[:, None]
+    sizes = [6 if gtsam.symbolChr(key) == ord("x") else 3 for key in map(ordering.at, range(ordering.size()))]
+    blocks = np.split(inverse, np.cumsum(sizes)[:-1])
+    by_cholesky = gtsam.Marginals(graph.linearize(values), values)
+    refused = []
+    for key, block in zip(map(ordering.at, range(ordering.size())), blocks, strict=True):
+        expected = block @ block.T
+        ours = Marginals(graph, values)
+        np.testing.assert_allclose(ours.marginalCovariance(key), expected, rtol=1e-5, atol=1e-9)
+        np.testing.assert_allclose(ours.jointMarginalCovariance([key]).fullMatrix(), expected, rtol=1e-5, atol=1e-9)
+        try:
+            by_cholesky.marginalCovariance(key)
+        except RuntimeError:
+            refused.append(key)
+    assert {L(0), L(1)} <= set(refused)  # it was made, and refuses questions
+
+
+def test_what_was_asked_before_changes_no_marginal():
+    graph, values = after_a_lost_heading()
+    asked_first = Marginals(graph, values)
+    asked_last = Marginals(graph, values)
+    first = {key: asked_first.marginalCovariance(key) for key in (L(0), L(1), X(0), X(2))}
+    last = {key: asked_last.marginalCovariance(key) for key in (X(2), X(0), L(1), L(0))}
+    for key, cov in first.items():
+        np.testing.assert_array_equal(cov, last[key])
 
 
 BODY_T_SONAR = gtsam.Pose3(gtsam.Rot3.Ypr(0.3, 0.4, 0.0), np.array([0.8, 0.1, -0.2]))

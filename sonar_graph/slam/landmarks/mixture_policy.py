@@ -36,7 +36,7 @@ from sonar_graph.slam.landmarks.mixture import (
 from sonar_graph.slam.landmarks.sighting import Screened, SeenFrame, Sighting, late_view
 from sonar_graph.slam.landmarks.tracked import NS_PER_S, GatedIdentity, RobustIdentity, second_rows_of_tracks
 from sonar_graph.slam.models import Kernel
-from sonar_graph.slam.smoother import marginals_of, solve_in_sight
+from sonar_graph.slam.smoother import Marginals, solve_in_sight
 from sonar_graph.states import Outcome
 from sonar_graph.tagged_sections import tagged
 
@@ -67,7 +67,7 @@ class ChosenHistory(NamedTuple):
     """Solution of the whole history with the choices that suit it best."""
 
     values: gtsam.Values
-    marginals: gtsam.Marginals | gtsam.ISAM2
+    marginals: Marginals
     watches: list[TrackedObject]
     choices: Choices
     """Choice for each tracked object."""
@@ -257,7 +257,7 @@ class MixtureIdentities:
                     break
                 values, choices = self._solve(rest, watches, start, better), better
             if values is not solved:
-                marginals = marginals_of(self._graph(rest, watches, choices), values)
+                marginals = Marginals(self._graph(rest, watches, choices), values)
             self._chosen = solved, heard, ChosenHistory(values, marginals, watches, choices)
         return self._chosen[2]
 

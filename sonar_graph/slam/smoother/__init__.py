@@ -6,7 +6,7 @@ undetermined (`observability`).
 
 # fmt: off
 from sonar_graph.slam.smoother.batch_solution import (
-    JointCovariance, Sightline, marginals_of, solve, solve_in_sight,
+    JointCovariance, Marginals, Sightline, solve, solve_in_sight,
 )
 from sonar_graph.slam.smoother.factor_store import FactorGroup, Factors
 from sonar_graph.slam.smoother.incremental import (
@@ -14,6 +14,6 @@ from sonar_graph.slam.smoother.incremental import (
 )
 
 __all__ = [
-    "BoundedHistory", "Changed", "FactorGroup", "Factors", "HistoryParams", "JointCovariance", "Sightline", "Smoother",
-    "SmootherParams", "WholeHistory", "marginals_of", "solve", "solve_in_sight",
+    "BoundedHistory", "Changed", "FactorGroup", "Factors", "HistoryParams", "JointCovariance", "Marginals", "Sightline",
+    "Smoother", "SmootherParams", "WholeHistory", "solve", "solve_in_sight",
 ]

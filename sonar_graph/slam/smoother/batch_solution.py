@@ -10,8 +10,10 @@ sightings say where to start it instead (docs/theory/isam2.md).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -110,13 +112,34 @@ def qr_tree(linear: gtsam.GaussianFactorGraph, values: gtsam.Values) -> gtsam.IS
     return tree
 
 
-def marginals_of(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Marginals | gtsam.ISAM2:
-    """Marginals of a graph, linearised at the values; by QR where Cholesky refuses."""
-    linear = graph.linearize(values)
-    try:
-        return gtsam.Marginals(linear, values)
-    except RuntimeError:
-        return qr_tree(linear, values)
+class Marginals:
+    """Marginal covariances of a graph, linearised at the values; by QR where Cholesky refuses.
+
+    GTSAM eliminates anew for each question, so that Cholesky may refuse one variable and not another. Each question
+    decides for itself: no answer depends on what was asked before.
+    """
+
+    def __init__(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
+        self._linear, self._values = graph.linearize(values), values
+        self._by_cholesky: gtsam.Marginals | None = None
+        with suppress(RuntimeError):
+            self._by_cholesky = gtsam.Marginals(self._linear, values)
+        self._by_qr: gtsam.ISAM2 | None = None
+
+    def marginalCovariance(self, key: int) -> Floats:
+        """Covariance of one variable; the name is GTSAM's."""
+        return np.asarray(self._ask(lambda marginals: marginals.marginalCovariance(key)))
+
+    def jointMarginalCovariance(self, keys: list[int]) -> gtsam.JointMarginal:
+        """Joint covariance of some; the name is GTSAM's."""
+        return self._ask(lambda marginals: marginals.jointMarginalCovariance(keys))
+
+    def _ask(self, question: Callable[[gtsam.Marginals | gtsam.ISAM2], Any]) -> Any:
+        if self._by_cholesky is not None:
+            with suppress(RuntimeError):
+                return question(self._by_cholesky)
+        self._by_qr = self._by_qr or qr_tree(self._linear, self._values)
+        return question(self._by_qr)
 
 
 MAX_PLACEMENTS = 3
@@ -196,7 +219,7 @@ class JointCovariance:
     """The first row of each variable, by key."""
 
     @classmethod
-    def of(cls, marginals: gtsam.Marginals | gtsam.ISAM2, keys: list[int]) -> JointCovariance:
+    def of(cls, marginals: Marginals | gtsam.ISAM2, keys: list[int]) -> JointCovariance:
         """Ask for poses (6 rows each), biases (11) and points (3)."""
         rows, n = {}, 0
         for key in keys:
@@ -221,7 +244,7 @@ class KeptCovariance:
         self._asked: set[int] = set()
         self._asked_before: set[int] = set()
 
-    def of(self, marginals: gtsam.Marginals | gtsam.ISAM2, keys: list[int]) -> JointCovariance:
+    def of(self, marginals: Marginals | gtsam.ISAM2, keys: list[int]) -> JointCovariance:
         """Joint covariance of these variables, and possibly of more."""
         self._asked.update(keys)
         if self._joint is None or not self._joint.rows.keys() >= self._asked:

@@ -24,8 +24,8 @@ from sonar_graph.measurements import Floats
 from sonar_graph.slam.smoother.batch_solution import (
     JointCovariance,
     KeptCovariance,
+    Marginals,
     Sightline,
-    marginals_of,
     picked,
     solve_in_sight,
 )
@@ -137,7 +137,7 @@ class Smoother:
             self._window = FixedLagWindow(params.relinearize_threshold, params.lag_s)
         self._taken_up = gtsam.NonlinearFactorGraph(), gtsam.Values()
         self._kept_covariance = KeptCovariance()
-        self._solved: tuple[gtsam.Values, gtsam.Marginals | gtsam.ISAM2] | None = None
+        self._solved: tuple[gtsam.Values, Marginals] | None = None
 
     @property
     def is_bounded(self) -> bool:
@@ -418,7 +418,7 @@ class Smoother:
             return self.joint_covariance(keys)
         return JointCovariance.of(self.solve_history()[1], keys)
 
-    def solve_history(self) -> tuple[gtsam.Values, gtsam.Marginals | gtsam.ISAM2]:
+    def solve_history(self) -> tuple[gtsam.Values, Marginals]:
         """Solve the whole graph from the present values; the solution, and what gives its marginal covariances.
 
         Ask that for ``marginalCovariance(key)`` or ``jointMarginalCovariance(keys)``.
@@ -427,5 +427,5 @@ class Smoother:
             graph = self.graph
             start = self._window.carried(self.values) if isinstance(self._window, SubmapWindow) else self.values
             values = solve_in_sight(graph, start, self._store.sightlines())
-            self._solved = values, marginals_of(graph, values)
+            self._solved = values, Marginals(graph, values)
         return self._solved
