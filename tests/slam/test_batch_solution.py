@@ -6,8 +6,16 @@ import pytest
 from gtsam.symbol_shorthand import L, X
 
 from sonar_graph.slam.models import factors
-from sonar_graph.slam.smoother import Smoother
-from sonar_graph.slam.smoother.batch_solution import Marginals, Sightline, Sightlines, placed_anew, solve, turned_away
+from sonar_graph.slam.smoother import Smoother, batch_solution
+from sonar_graph.slam.smoother.batch_solution import (
+    Marginals,
+    Sightline,
+    Sightlines,
+    placed_anew,
+    solve,
+    solve_in_sight,
+    turned_away,
+)
 
 from .fed import FOREVER_S, SONAR, in_the_basin
 from .graphs import gtsams_solution
@@ -178,3 +186,21 @@ def test_a_new_start_that_ends_higher_is_not_taken():
     assert np.linalg.norm(elsewhere.atPoint3(L(1)) - world_point(*Z)) > 1.0
     assert np.linalg.norm(values.atPoint3(L(1)) - world_point(*Z)) < 0.01
     assert smoother.graph.error(values) < smoother.graph.error(elsewhere)
+
+
+@pytest.mark.parametrize("most", [1, 2, 5])
+def test_a_solution_tries_no_more_steps_than_two_descents_may(most, monkeypatch):
+    """Sightlines astern of a sonar that looks ahead: as often as landmarks are placed anew, they stay behind."""
+    tried = []
+    step = batch_solution.damped_step
+    monkeypatch.setattr(batch_solution, "damped_step", lambda *given: tried.append(1) or step(*given))
+    graph, initial = round_trip(1)
+    astern = [Sightline(X(k), SONAR, np.array([2.0, np.pi])) for k in range(12)]
+    lines = {key: astern for key in initial.keys() if gtsam.symbolChr(key) == ord("l")}  # noqa: SIM118
+    freely = solve_in_sight(graph, initial, lines)
+    needed = len(tried)
+    tried.clear()
+    monkeypatch.setattr(batch_solution, "MAX_STEPS", most)
+    bounded = solve_in_sight(graph, initial, lines)
+    assert most <= len(tried) <= 2 * most < needed
+    assert graph.error(freely) < graph.error(bounded) < graph.error(initial)

@@ -21,7 +21,8 @@ import numpy as np
 from sonar_graph.measurements import Floats
 from sonar_graph.motion import BIASES
 
-MAX_ITERATIONS = 50
+MAX_STEPS = 50
+"""Steps that a descent may try, whether or not they lower the error: each costs a factorisation of the graph."""
 RELATIVE_DECREASE = 1e-6
 """Stop when an iteration lowers the error by less than this share of it."""
 LEAST_DECREASE = 1e-5
@@ -31,10 +32,15 @@ DAMPING_FACTOR = 10.0
 MAX_DAMPING = 1e9
 
 
-def solve(
-    graph: gtsam.NonlinearFactorGraph, initial: gtsam.Values, most_iterations: int = MAX_ITERATIONS
-) -> gtsam.Values:
-    """Levenberg–Marquardt from ``initial``.
+def solve(graph: gtsam.NonlinearFactorGraph, initial: gtsam.Values) -> gtsam.Values:
+    """Solution by Levenberg–Marquardt; the initial values where no step lowers the error."""
+    return descended(graph, initial, MAX_STEPS)[0]
+
+
+def descended(
+    graph: gtsam.NonlinearFactorGraph, initial: gtsam.Values, most_steps: int
+) -> tuple[gtsam.Values, float, int]:
+    """Levenberg–Marquardt from ``initial``, in at most so many steps.
 
     Minimises the sum of squared whitened (and robustly weighted) errors. Damping multiplies the identity; it starts
     negligible (a Gauss–Newton step) and grows tenfold while a step does not lower the error (Nocedal and Wright,
@@ -43,17 +49,17 @@ def solve(
 
     Returns
     -------
-    gtsam.Values
-        The solution; the initial values where no step lowers the error.
+    The values reached, their error, and the number of steps that were tried.
     """
     values, error = initial, graph.error(initial)
-    damping, ordering = FIRST_DAMPING, None
-    for _ in range(most_iterations):
+    damping, ordering, tried = FIRST_DAMPING, None, 0
+    while tried < most_steps:
         linear = graph.linearize(values)
         if ordering is None:
             ordering = gtsam.Ordering.ColamdGaussianFactorGraph(linear)
         candidate, candidate_error = values, np.inf
-        while damping <= MAX_DAMPING:
+        while damping <= MAX_DAMPING and tried < most_steps:
+            tried += 1
             try:
                 step = damped_step(linear, values, damping, ordering)
                 candidate = values.retract(step)
@@ -77,7 +83,7 @@ def solve(
         values, error = candidate, candidate_error
         if decrease <= max(RELATIVE_DECREASE * error, LEAST_DECREASE):
             break
-    return values
+    return values, error, tried
 
 
 def damped_step(
@@ -142,10 +148,6 @@ class Marginals:
         return question(self._by_qr)
 
 
-MAX_PLACEMENTS = 3
-"""Times that stuck landmarks are placed anew in one solution."""
-
-
 @dataclass(frozen=True, eq=False, slots=True)
 class Sightline:
     """One sighting of a landmark."""
@@ -193,16 +195,18 @@ def placed_anew(values: gtsam.Values, sightlines: Sightlines, landmark_keys: lis
 
 
 def solve_in_sight(graph: gtsam.NonlinearFactorGraph, initial: gtsam.Values, sightlines: Sightlines) -> gtsam.Values:
-    """Solve a graph; again while a landmark is stuck behind the sonar and its new start lowers the error."""
-    values = solve(graph, initial)
-    for _ in range(MAX_PLACEMENTS):
-        stuck = turned_away(values, sightlines)
-        if not stuck:
+    """Solve a graph; again while a landmark is stuck behind the sonar and its new start lowers the error.
+
+    All that begins anew may try `MAX_STEPS` together, so that a graph whose measurements contradict each other, where
+    landmarks stay behind, costs twice what one descent may.
+    """
+    (values, error, _), left = descended(graph, initial, MAX_STEPS), MAX_STEPS
+    while left and (stuck := turned_away(values, sightlines)):
+        retried, lower, tried = descended(graph, placed_anew(values, sightlines, stuck), left)
+        left -= tried
+        if lower >= error:
             break
-        retried = solve(graph, placed_anew(values, sightlines, stuck))
-        if graph.error(retried) >= graph.error(values):
-            break
-        values = retried
+        values, error = retried, lower
     return values
 
 
