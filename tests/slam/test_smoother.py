@@ -132,7 +132,7 @@ def test_what_is_taken_out_was_never_there(monkeypatch, lag_s, oldest):
     fed = on_the_rail(NODES, lag_s)
     fed.smoother.solve_history()
     gone = [(k, i) for k in range(oldest, NODES) for i in (4, 7)]
-    solved = counted(monkeypatch, batch_solution, "solve")
+    solved = counted(monkeypatch, batch_solution, "descended")
     removed = [handle for k, i in gone for handle in fed.handles_on(X(k), L(i))]
     assert len(removed) == len(gone)
     fed.smoother.exchange(END_S, removed)
@@ -169,7 +169,7 @@ def test_after_wrong_factors_are_taken_out_the_estimate_is_that_of_the_others_at
         fed.smoother.update(14.0)
     batch = solve(graph_of(fed.given), fed.smoother.values)
     off_m = [np.linalg.norm(fed.smoother.values.atPoint3(L(3)) - batch.atPoint3(L(3)))]
-    solved = counted(monkeypatch, batch_solution, "solve")
+    solved = counted(monkeypatch, batch_solution, "descended")
     if gives_up:
         fed.smoother._window._isam = Refusing(fed.smoother._window._isam)
     fed.smoother.exchange(14.0, wrong)
@@ -192,7 +192,7 @@ def test_a_landmark_without_factors_leaves_the_graph_and_can_come_back():
 
 
 def test_a_held_keyframe_takes_late_factors_without_solving_the_history(monkeypatch):
-    fed, solved = on_the_rail(NODES, 0.6, held={X(3): FOREVER_S}), counted(monkeypatch, batch_solution, "solve")
+    fed, solved = on_the_rail(NODES, 0.6, held={X(3): FOREVER_S}), counted(monkeypatch, batch_solution, "descended")
     handles = fed.smoother.exchange(END_S, (), [FactorGroup(ranged(3, 4, 24.0))]).added
     assert not solved
     assert_all_is_least_squares(fed, with_ranges([], (3, 4, 24.0)))
@@ -262,7 +262,7 @@ def test_a_window_that_begins_anew_says_what_the_batch_does(lag_s):
 
 
 def test_on_the_rail_restarts_of_a_bounded_window_change_nothing(monkeypatch):
-    solved = counted(monkeypatch, batch_solution, "solve")
+    solved = counted(monkeypatch, batch_solution, "descended")
     fed = on_the_rail(61, 3.1, stale_shift_m=1e-9, is_bounded=True)
     assert len(solved) >= 3
     assert_is_least_squares(fed, rail(61)[1], 61)
@@ -287,7 +287,7 @@ def test_drift_beyond_what_cholesky_takes_is_survived():
 
 @pytest.mark.parametrize(("shift_m", "is_due"), [(0.09, False), (0.11, True)])
 def test_a_bounded_window_restarts_once_a_landmark_has_moved_by_the_stale_shift(monkeypatch, shift_m, is_due):
-    solved = counted(monkeypatch, batch_solution, "solve")
+    solved = counted(monkeypatch, batch_solution, "descended")
     smoother = smoother_with(1e9, 1.0, 0.1, is_bounded=True)
     smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
     smoother.add({"prior": pose_prior(X(0), gtsam.Pose3(), 1e-6)})
