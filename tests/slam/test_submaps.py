@@ -8,7 +8,7 @@ from gtsam.symbol_shorthand import B, L, X
 from sonar_graph.slam.smoother import submap_window
 from sonar_graph.slam.smoother.batch_solution import picked
 from sonar_graph.slam.smoother.submap_window import Submap
-from sonar_graph.slam.smoother.submaps import SubmapFactor, level_frame
+from sonar_graph.slam.smoother.submaps import Attitude, SubmapFactor, level_frame
 
 from .fed import Fed, assert_is_least_squares, in_the_basin, on_the_rail
 from .graphs import off_sigmas
@@ -80,6 +80,19 @@ def driven_on(values: gtsam.Values) -> gtsam.Values:
         elif gtsam.symbolChr(key) == ord("l"):
             moved.update(key, motion.transformFrom(values.atPoint3(key)))
     return moved
+
+
+def test_a_turn_about_the_vertical_leaves_the_tilt_as_it_was():
+    """Exactly, from wherever and however far; of the logarithm half of it turns with it."""
+    before = gtsam.Rot3.RzRyRx(0.3, -0.2, 2.0)
+    for tilt in (gtsam.Rot3(), gtsam.Rot3.RzRyRx(0.05, -0.08, 0.1)):
+        after, up = before.compose(tilt), before.matrix()[2]
+        for turn_rad in (-2.0, 0.4):
+            wound = gtsam.Rot3.Rz(turn_rad).compose(after)
+            expected = Attitude(before).turn_to(Attitude(after))[0] + turn_rad * up
+            assert Attitude(before).turn_to(Attitude(wound))[0] == pytest.approx(expected, abs=1e-12)
+    off = gtsam.Rot3.Logmap(before.between(wound)) - gtsam.Rot3.Logmap(before.between(after)) - turn_rad * up
+    assert np.abs(off).max() > 0.01
 
 
 def test_a_submap_that_moves_as_a_whole_stays_exact():
