@@ -563,7 +563,10 @@ class FilterShell(ABC):
         return ids, Views(stamps_ns, landmark, z, R_z, outcome, e, S)
 
     def _samples(self, measurements: Measurements, depth: Depth | None, since_ns: int) -> dict[int, Any]:
-        """Samples of a call, a block for each kind. Unsound rows and late headings are refused; a late fix is used."""
+        """Samples of a call, a block for each kind. Unsound rows and late headings are refused; a late fix is used.
+
+        Rows before the first epoch is reached are passed over.
+        """
         samples: dict[int, Any] = {} if depth is None else {DEPTH: depth}
         heading, fixes = measurements.heading, measurements.positions
         aiding: list[tuple[int, str, Any]] = [(HEADING, "heading", heading), (FIX, "positions", fixes)]
@@ -571,7 +574,7 @@ class FilterShell(ABC):
             if block is None:
                 continue
             is_sound, is_late = block.are_sound(), block.stamps_ns < since_ns
-            for row in np.flatnonzero(~is_sound | is_late).tolist():
+            for row in np.flatnonzero((~is_sound | is_late) & (block.stamps_ns >= self._reached_ns)).tolist():
                 if not (is_sound[row] and kind == FIX and self._use_late(block, row, since_ns)):
                     reason = Refusal.LATE if is_sound[row] else Refusal.UNSOUND
                     self._refused.append(RefusedRow(sensor, int(block.stamps_ns[row]), reason, math.nan))
@@ -586,7 +589,7 @@ class FilterShell(ABC):
         shares the error of this motion, which is left out: the fix tells rather too little.
         """
         stamp_ns, node_ns = int(fixes.stamps_ns[row]), self.node_ns
-        if stamp_ns < max(self._reached_ns, node_ns - KEPT_NS):
+        if stamp_ns < node_ns - KEPT_NS:
             return False
         first_ns, last_ns = min(stamp_ns, node_ns), max(stamp_ns, node_ns)
         between = self.odometry.motion(first_ns, last_ns, self.gyro_bias(), self.attitude(), since_ns)
