@@ -247,7 +247,8 @@ class Keyframes:
         motion = self._motion(start_ns, node_ns, bias, attitude, known_ns)
         self.smoother.add_pose(X(j), world_T_i.compose(motion.i_T_j), node_ns * S_PER_NS)
         if self._bends:
-            between = factors.odometry_with_bias(X(i), X(j), self.bias_keys[i], motion)
+            up_j = self._up(attitude) @ motion.i_T_j.rotation().matrix()
+            between = factors.odometry_with_bias(X(i), X(j), self.bias_keys[i], motion, up_j)
         else:
             between = factors.odometry(X(i), X(j), motion)
         self.smoother.add({"odometry": between})

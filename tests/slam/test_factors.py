@@ -55,11 +55,12 @@ def beginnings(pose: gtsam.Pose3, rng: np.random.Generator) -> Made:
 
 def odometries(pose: gtsam.Pose3, rng: np.random.Generator) -> Made:
     """Near no error, far off, and off by nearly half a turn."""
-    for spread, turn in ((0.0, 0.0), (1.0, 0.0), (0.1, np.pi - 0.05)):
+    for spread, turn in ((0.0, 0.0), (1.0, 0.0), (0.1, np.pi - 0.1)):
         motion, bias = some_motion(int(rng.integers(99)), 0.05), spread * 0.03 * rng.standard_normal(11)
         X_j = pose.compose(motion.corrected(bias)).compose(gtsam.Pose3.Expmap(0.3 * spread * rng.standard_normal(6)))
         values = values_of(X0=pose, X1=X_j.compose(gtsam.Pose3(gtsam.Rot3.Rz(turn), np.zeros(3))), B0=bias)
-        yield factors.odometry_with_bias(X(0), X(1), B(0), motion), values
+        up = X_j.rotation().matrix()[2] if spread else gtsam.Rot3.RzRyRx(*rng.uniform(-0.4, 0.4, 3)).matrix()[2]
+        yield factors.odometry_with_bias(X(0), X(1), B(0), motion, up), values
         if spread == 0.0:  # GTSAM's has the derivative of no error
             values = values_of(X0=pose, X1=pose.compose(motion.i_T_j))
             yield factors.odometry(X(0), X(1), motion), values
@@ -125,6 +126,25 @@ def test_odometry_error_is_what_the_pose_is_off_the_corrected_motion():
     off = X_j.compose(gtsam.Pose3.Expmap(perturbation))
     assert np.allclose(factor.unwhitenedError(values_of(X0=pose, X1=off, B0=bias)), perturbation)
     assert not np.allclose(factor.unwhitenedError(values_of(X0=pose, X1=X_j, B0=motion.bias)), 0, atol=1e-3)
+
+
+def test_a_bias_of_the_heading_turns_about_the_vertical_wherever_the_estimate_has_it():
+    """Where the tilt is estimated otherwise than when the motion was set, too: then it never is a tilt for gravity."""
+    motion, pose, rng = some_motion(2, 0.05), POSES["random"], np.random.default_rng(5)
+    up_j, h, turned = np.array([0.1, -0.2, 0.97]), np.array([3.0, -1.0, 7.0]), np.zeros(11)
+    D_bias = motion.D_bias.copy()
+    up_j /= np.linalg.norm(up_j)
+    D_bias[:, 3:6] = np.vstack((np.outer(up_j, h), np.zeros((3, 3))))
+    factor = factors.odometry_with_bias(X(0), X(1), B(0), replace(motion, D_bias=D_bias), up_j)
+    X_j, bias = pose.compose(motion.i_T_j).compose(gtsam.Pose3.Expmap(0.2 * rng.standard_normal(6))), motion.bias
+    turned[3:6] = 0.05 * rng.standard_normal(3)
+    about_vertical = gtsam.Pose3(gtsam.Rot3.Rz(h @ turned[3:6]).compose(X_j.rotation()), X_j.translation())
+    errors = [
+        factor.unwhitenedError(values_of(X0=pose, X1=x, B0=bias + b))
+        for x, b in ((X_j, 0.0 * bias), (about_vertical, turned))
+    ]
+    assert abs(h @ turned[3:6]) > 0.1
+    assert np.allclose(*errors, atol=1e-12)
 
 
 @pytest.mark.parametrize("sigma", [0.05, 1e-5, 1e-7])
