@@ -44,7 +44,7 @@ class DeadReckoning:
     the covariance and correlates successive errors. Roll and pitch are kept by the direction of gravity, with
     ``up = world_R_body^T e_z`` (`sonar_graph.navigation.alignment.gravity_direction`)::
 
-        e = measured up - up,    H = [ [up]x  0  0 ],    K = P H^T (H P H^T + sigma^2 I)^-1, zero for the bias
+        e = measured up - up,    H = [ [up]x  0  0 ],    K = P H^T (H P H^T + sigma^2 I)^-1, of the tilt alone
         P <- (I - K H) P (I - K H)^T + sigma^2 K K^T
 
     Depth and detections are not used.
@@ -147,7 +147,9 @@ class DeadReckoning:
         H = np.zeros((3, 9))
         H[:, :3] = np.cross(np.eye(3), up)  # [up]x
         K = np.linalg.solve(H @ self._P @ H.T + sigma**2 * np.eye(3), H @ self._P).T
-        K[6:] = 0.0
+        K[:3] -= np.outer(up, up @ K[:3])
+        K[:3] -= np.outer(up, up @ K[:3])  # through the bias it would reach heading and place, and turn the path
+        K[3:] = 0.0
         A = np.eye(9) - K @ H
         self._pose = self._pose.compose(gtsam.Pose3.Expmap((K @ (measured - up))[:6]))
         P = A @ self._P @ A.T + sigma**2 * K @ K.T

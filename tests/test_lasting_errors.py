@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from baselines.dead_reckoning import DeadReckoning
 from baselines.ekf_slam import EkfSlam
 from baselines.invariant_ekf import InvariantEkf
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting, Start
@@ -104,7 +105,7 @@ def test_the_scale_lengthens_the_way_of_the_doppler_log():
 estimators = pytest.mark.parametrize("kind", [InvariantEkf, Isam2])
 
 
-@estimators
+@pytest.mark.parametrize("kind", [DeadReckoning, InvariantEkf, Isam2])
 def test_gravity_tells_the_tilt_and_nothing_of_the_heading(kind):
     """Rolled by 17 degrees it would tell the gyro's bias about the vertical, if that were there once."""
     with_it = known(gyro_bias_sigma=1e-2, gyro_bias_walk_density=0.0)
@@ -113,10 +114,26 @@ def test_gravity_tells_the_tilt_and_nothing_of_the_heading(kind):
     told, untold = (estimates[-1].covariance[:3, :3] for _, estimates in both)
     up = both[0][1][-1].world_T_body.rotation().matrix()[2]
     assert up @ told @ up == pytest.approx(up @ untold @ up, rel=1e-2)
-    assert np.trace(told) - up @ told @ up < 0.1 * (np.trace(untold) - up @ untold @ up)
+    share = 0.3 if kind is DeadReckoning else 0.1  # which estimates no bias
+    assert np.trace(told) - up @ told @ up < share * (np.trace(untold) - up @ untold @ up)
+    if kind is DeadReckoning:
+        return
     turned = biases_of(both[0][0])[1][HEADING, HEADING]
     np.testing.assert_allclose(turned, 1e-4 * np.eye(3), atol=1e-6)
     assert biases_of(both[0][0])[1][TILT, TILT][0, 0] < 0.1 * 1e-4
+
+
+def test_gravity_corrects_the_tilt_alone_where_a_bias_is_considered():
+    """However the covariance ties it to heading and place, as gyro biases do in turns that are rolled."""
+    sequence = turning(known(gyro_bias_sigma=1e-2), accel_bias=(0.5, 0.3, 0.0))
+    reckoner, estimates = ran(DeadReckoning, sequence)
+    root = 0.1 * np.random.default_rng(0).normal(size=(9, 9))
+    reckoner._P, before, ahead = root @ root.T, estimates[-1].world_T_body, (np.array([0.5, 0.0, 0.0]), 1e-4)
+    reckoner._level(motion_of(sequence), ahead, ahead)
+    turn = gtsam.Rot3.Logmap(before.rotation().between(reckoner._pose.rotation()))
+    assert np.linalg.norm(turn) > 1e-3
+    assert turn @ before.rotation().matrix()[2] == pytest.approx(0.0, abs=1e-12)
+    np.testing.assert_array_equal(reckoner._pose.translation(), before.translation())
 
 
 @estimators
