@@ -563,17 +563,18 @@ class FilterShell(ABC):
         return ids, Views(stamps_ns, landmark, z, R_z, outcome, e, S)
 
     def _samples(self, measurements: Measurements, depth: Depth | None, since_ns: int) -> dict[int, Any]:
-        """Samples of a call, a block for each kind. Unsound rows and late headings are refused; a late fix is used.
+        """Samples of a call, a block for each kind. Unsound and late rows are refused, but a late fix is used.
 
         Rows before the first epoch is reached are passed over.
         """
-        samples: dict[int, Any] = {} if depth is None else {DEPTH: depth}
+        samples: dict[int, Any] = {}
         heading, fixes = measurements.heading, measurements.positions
-        aiding: list[tuple[int, str, Any]] = [(HEADING, "heading", heading), (FIX, "positions", fixes)]
-        for kind, sensor, block in aiding:
+        given: list[tuple[int, str, Any]] = [(DEPTH, "depth", depth), (HEADING, "heading", heading)]
+        for kind, sensor, block in [*given, (FIX, "positions", fixes)]:
             if block is None:
                 continue
-            is_sound, is_late = block.are_sound(), block.stamps_ns < since_ns
+            is_sound = np.ones(len(block), np.bool_) if kind == DEPTH else block.are_sound()
+            is_late = block.stamps_ns < since_ns
             for row in np.flatnonzero((~is_sound | is_late) & (block.stamps_ns >= self._reached_ns)).tolist():
                 if not (is_sound[row] and kind == FIX and self._use_late(block, row, since_ns)):
                     reason = Refusal.LATE if is_sound[row] else Refusal.UNSOUND

@@ -12,11 +12,11 @@ from baselines.ekf_slam import EkfSlam, EkfSlamParams
 from baselines.invariant_ekf import InvariantEkf, InvariantEkfParams
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting, Start
 from sonar_graph.estimator import Estimator
-from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Heading, Imu, PositionFixes
+from sonar_graph.measurements import NS_PER_S, Depth, Dvl, Floats, Heading, Imu, Measurements, PositionFixes
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.slam import GaussianKernel, Isam2, Isam2Params, KeyframeParams, RobustKernel, SmootherParams
-from sonar_graph.states import Estimate
+from sonar_graph.states import Estimate, Refusal
 
 from .slam.rail import STEP_S, T0_NS, rail
 
@@ -188,3 +188,38 @@ def test_without_sightings_a_state_carries_the_bias_as_dead_reckoning_does(kind)
     assert covariances < 1e-3
     unaware = run(made(DeadReckoning, winding().calibration), sequence, 3.7)
     assert difference(unaware, reckoned)[1] > 0.1
+
+
+@pytest.mark.parametrize("kind", [EkfSlam, InvariantEkf, Isam2])
+def test_rows_of_a_call_older_than_the_newest_are_used_or_named(kind):
+    """Rows of a sensor come 2 s late, in a call that ends before the one before: a fix counts, the others cannot."""
+    sequence, _ = rail(NODES)
+    estimator, others = made(kind, sequence.calibration), made(kind, sequence.calibration)
+    run(estimator, sequence), run(others, sequence)
+    end_ns = sequence.end_ns
+    late_ns = np.array([end_ns - 3 * NS_PER_S, end_ns - 2 * NS_PER_S])
+    z_m, yaw_rad, sigma = np.zeros(2), np.zeros(2), np.full(2, 0.01)
+    late = Measurements(
+        int(late_ns[-1]),
+        depth=Depth(late_ns, z_m, sigma**2),
+        heading=Heading(late_ns, yaw_rad, sigma),
+        positions=PositionFixes(late_ns, np.full((2, 3), 0.3), np.tile(1e-6 * np.eye(3), (2, 1, 1))),
+    )
+    assert estimator.process(late) is None
+    named = [(row.sensor, row.stamp_ns, row.reason) for row in estimator.refused_rows()]
+    expected = [(sensor, int(t), Refusal.LATE) for sensor in ("depth", "heading") for t in late_ns]
+    assert sorted(named) == sorted([*((r.sensor, r.stamp_ns, r.reason) for r in others.refused_rows()), *expected])
+    asked = Measurements(end_ns + 1)
+    (after,), (without,) = ([e] for e in (estimator.process(asked), others.process(asked)))
+    assert np.linalg.norm(after.world_T_body.translation() - without.world_T_body.translation()) > 0.01
+
+
+@pytest.mark.parametrize("kind", [EkfSlam, InvariantEkf, Isam2])
+def test_rows_from_before_the_first_epoch_are_not_called_late(kind):
+    """A sensor that is switched on first."""
+    sequence, _ = rail(NODES)
+    early_ns = np.array([T0_NS - 2 * NS_PER_S, T0_NS - NS_PER_S])
+    depth, heading = Depth(early_ns, np.zeros(2), np.full(2, 1e-4)), Heading(early_ns, np.zeros(2), np.full(2, 0.01))
+    estimator = made(kind, sequence.calibration)
+    run(estimator, replace(sequence, depth=depth, heading=heading))
+    assert not estimator.refused_rows()

@@ -136,16 +136,17 @@ class Isam2:
 
         None before IMU and DVL have begun, and for an instant before that of an earlier call.
         """
+        self._keyframes.add(measurements.imu, measurements.dvl, measurements.depth, measurements.heading)
+        fixes = [] if measurements.positions is None else self._fixes(measurements.positions)
         if self._asked.newest_ns is not None and measurements.end_ns < self._asked.newest_ns:
-            self._keyframes.add(measurements.imu, measurements.dvl)  # rows that are still new count
+            for _, take_in in fixes:
+                take_in()
             if measurements.detections is not None:
                 stamps_ns, ids = measurements.detections.stamps_ns, measurements.detections.most_probable()[0]
                 for stamp_ns, landmark_id in zip(stamps_ns.tolist(), ids.tolist(), strict=True):
                     self._sightings.journal.record(stamp_ns, landmark_id, Outcome.LATE)
             return None
-        self._keyframes.add(measurements.imu, measurements.dvl, measurements.depth, measurements.heading)
         frames = [] if measurements.detections is None else list(measurements.detections.frames())
-        fixes = [] if measurements.positions is None else self._fixes(measurements.positions)
         for stamp_ns, take_in in sorted(
             [(int(frame.stamps_ns[0]), partial(self._sightings.add, frame)) for frame in frames] + fixes,
             key=lambda event: event[0],

@@ -95,6 +95,7 @@ class Keyframes:
         self._linearised: tuple[Floats, Floats] = np.zeros(BIASES), np.eye(3)
         self._waiting: dict[str, list[Any]] = {"depth": [], "heading": []}
         self._lag_ns = min(round(min(self.smoother.params.lag_s, 1e9) / S_PER_NS), LONGEST_LATE_NS)
+        self._newest_heading_ns = EARLIEST_NS
         self._told = 0
         self._refused: list[RefusedRow] = []
 
@@ -120,21 +121,27 @@ class Keyframes:
         return X(bisect_left(self.stamps_ns, self.stamps_ns[-1] - round(age_s / S_PER_NS)))
 
     def add(self, imu: Imu | None, dvl: Dvl | None, depth: Depth | None = None, heading: Heading | None = None) -> None:
-        """Take in rows; the source of motion says which depths are used, and unsound or late headings are refused."""
+        """Take in rows; the source of motion says which depths are used.
+
+        Unsound headings are refused, and depths and headings that come after their keyframe was set.
+        """
         self.odometry.add(imu, dvl)
         self._latest = None
+        set_ns = self.stamps_ns[-1] if self.stamps_ns else EARLIEST_NS
         if (depth := self.odometry.used_depths(depth)) is not None:
-            self._waiting["depth"].append(depth)
+            for stamp_ns in depth.stamps_ns[depth.stamps_ns <= set_ns].tolist():
+                self.refuse("depth", stamp_ns, Refusal.LATE)
+            if (depth := depth.between(set_ns, LATEST_NS)) is not None:
+                self._waiting["depth"].append(depth)
         if heading is None:
             return
-        waiting = self._waiting["heading"]
-        newest_ns = waiting[-1].stamps_ns[-1] if waiting else EARLIEST_NS
-        is_sound, is_new = heading.are_sound(), heading.stamps_ns > newest_ns
-        for stamp_ns, sound in zip(heading.stamps_ns.tolist(), is_sound.tolist(), strict=True):
-            if not sound or stamp_ns < newest_ns:
+        is_sound, is_new = heading.are_sound(), heading.stamps_ns > max(self._newest_heading_ns, set_ns)
+        for stamp_ns, sound, new in zip(heading.stamps_ns.tolist(), is_sound.tolist(), is_new.tolist(), strict=True):
+            if not sound or not (new or stamp_ns == self._newest_heading_ns):  # which was sent again
                 self.refuse("heading", stamp_ns, Refusal.LATE if sound else Refusal.UNSOUND)
         if (is_sound & is_new).any():
-            waiting.append(heading.rows(np.flatnonzero(is_sound & is_new)))
+            self._waiting["heading"].append(rows := heading.rows(np.flatnonzero(is_sound & is_new)))
+            self._newest_heading_ns = int(rows.stamps_ns[-1])
 
     def refuse(self, sensor: str, stamp_ns: int, reason: Refusal) -> None:
         """Take note of a row that is not used."""
