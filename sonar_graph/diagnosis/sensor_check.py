@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
+from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import DvlCalibration, Start
@@ -54,6 +55,11 @@ FORCES = {"g": 9.80665, "mg": 9.80665e-3, "cm/s²": 1e-2, "mm/s²": 1e-3}
 SHARE_OF_GRAVITY = 0.2
 """Relative difference allowed between a typical specific force and gravity."""
 USUAL_SPEED_M_S = 3.0
+PAIR_S, LONGEST_PAIR_S = 1.0, 3.0
+"""Time between two sightings of a landmark that are compared: long enough to move, and short enough to turn little."""
+FEWEST_PAIRS, MEDIAN_ROWS = 20, 9
+LARGEST_RANGE_RATIO = 10.0
+"""Changes of range by the Doppler log over those measured: 1 but for noise and turns, 100 in cm/s."""
 HIGH_PERCENTILE = 95.0
 LEAST_SECONDS = 30
 LEAST_TILTING_RAD_S = 0.02
@@ -64,14 +70,20 @@ LARGEST_TILT_RATIO = 10.0
 def wrong_units(sequence: Sequence, config: LogConfig) -> list[Finding]:
     """Velocities, rates and specific forces in an implausible unit; the configured scales enter the advice."""
     advice: dict[str, str] = {}
-    speed_m_s = _exceeded_by_few(sequence.dvl.velocity)
-    if speed_m_s > FASTEST_M_S:
+    speed_m_s, changes_m = _exceeded_by_few(sequence.dvl.velocity), range_changes(sequence)
+    is_far = changes_m is not None and changes_m[1] > LARGEST_RANGE_RATIO * changes_m[0]
+    if speed_m_s > FASTEST_M_S or is_far:
         unit = next((unit for unit, factor in SPEEDS.items() if speed_m_s * factor <= USUAL_SPEED_M_S), "mm/s")
         scale = float(config.table("dvl").get("scale", 1.0)) * SPEEDS[unit]
+        why = f"up to {speed_m_s:.3g} m/s"
+        if is_far and changes_m is not None:
+            why += "; ranges to landmarks change by {:.3g} m, by them by {:.3g} m".format(*changes_m)
         advice["DVL: unit"] = (
-            f"velocities look {1 / SPEEDS[unit]:.0f} times too large (up to {speed_m_s:.3g} m/s): {unit}? "
+            f"velocities look {1 / SPEEDS[unit]:.0f} times too large ({why}): {unit}? "
             f"`scale = {scale:.4g}` under [dvl] {IN_LOG_CONFIG}"
         )
+        if speed_m_s > FASTEST_M_S and unit != "mm/s":
+            advice["DVL: unit"] += f"; mm/s if the vehicle moves at {speed_m_s * SPEEDS['mm/s']:.2g} m/s"
     rate_rad_s = _exceeded_by_few(sequence.imu.angular_velocity)
     tilting = tilt_rates(sequence.imu)
     doubt = f"57 times too large (up to {rate_rad_s:.3g} rad/s)" if rate_rad_s > FASTEST_TURN_RAD_S else ""
@@ -112,6 +124,37 @@ def tilt_rates(imu: Imu) -> tuple[float, float] | None:
     by_gyros = np.linalg.norm(np.cross((rate[1:] + rate[:-1]) / 2, up[:-1]), axis=1)
     by_gravity = np.linalg.norm(np.diff(up, axis=0), axis=1)
     return float(np.median(by_gyros[is_next])), float(np.median(by_gravity[is_next]))
+
+
+def range_changes(sequence: Sequence) -> tuple[float, float] | None:
+    """Median change of the range to a landmark between sightings, and by the Doppler log, m; None where few are known.
+
+    With u the direction in which it is seen, `r_j - r_i = -∫ u·v dt`. The noise of ranges makes the first one larger.
+    """
+    seen, dvl, calibration = sequence.detections, sequence.dvl, sequence.calibration
+    rows = np.flatnonzero(np.isfinite(dvl.velocity).all(axis=1))
+    if seen is None or len(rows) < MEDIAN_ROWS:
+        return None
+    dvl_s, t = ((stamps_ns - dvl.stamps_ns[rows[0]]) * 1e-9 for stamps_ns in (dvl.stamps_ns[rows], seen.stamps_ns))
+    body_v = dvl.velocity[rows] @ calibration.dvl.mounting.pose().rotation().matrix().T
+    body_v = median_filter(body_v, size=(MEDIAN_ROWS, 1))  # outliers would add up
+    steps = (body_v[1:] + body_v[:-1]) / 2 * np.diff(dvl_s)[:, None]
+    path = np.vstack([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    ids, is_sound = seen.most_probable()[0], seen.are_sound() & (t >= 0) & (t <= dvl_s[-1])
+    ahead = np.column_stack([np.cos(seen.azimuth_rad), np.sin(seen.azimuth_rad), np.zeros(len(seen))])
+    u = ahead @ calibration.sonar.mounting.pose().rotation().matrix().T
+    measured, by_dvl = [], []
+    for landmark_id in np.unique(ids[is_sound & (ids >= 0)]).tolist():
+        rows = np.flatnonzero(is_sound & (ids == landmark_id))
+        later = rows[np.minimum(np.searchsorted(t[rows], t[rows] + PAIR_S), len(rows) - 1)]
+        pairs = (t[later] - t[rows] >= PAIR_S) & (t[later] - t[rows] <= LONGEST_PAIR_S)
+        i, j = rows[pairs], later[pairs]
+        moved = np.column_stack([np.interp(t[j], dvl_s, p) - np.interp(t[i], dvl_s, p) for p in path.T])
+        measured += np.abs(seen.range_m[j] - seen.range_m[i]).tolist()
+        by_dvl += np.abs(np.einsum("ka,ka->k", moved, (u[i] + u[j]) / 2)).tolist()
+    if len(measured) < FEWEST_PAIRS:
+        return None
+    return max(float(np.median(measured)), calibration.sonar.range_sigma_m), float(np.median(by_dvl))
 
 
 def _exceeded_by_few(vectors: Floats) -> float:

@@ -137,6 +137,7 @@ def render_report(comparison: Comparison) -> str:
         "finding": sentences.finding(comparison),
         "doubts": [
             *sentences.doubt_of_identities(comparison),
+            *sentences.outliers(comparison),
             *sentences.withheld_lines(comparison),
             *sentences.warning_lines(sequence.notes),
         ],

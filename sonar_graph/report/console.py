@@ -74,7 +74,7 @@ def _lines_below(comparison: Comparison, metric: str | None) -> list[str]:
     lines += sentences.lost_runs(comparison)
     lines += sentences.refusal_lines(comparison)
     lines += sentences.withheld_lines(comparison)
-    lines += sentences.doubt_of_identities(comparison)
+    lines += [*sentences.doubt_of_identities(comparison), *sentences.outliers(comparison)]
     lines += sentences.nameless_landmarks(comparison)
     lines += sentences.doubt_lines(comparison.sequence.notes)
     if comparison.recognition is not None:

@@ -40,6 +40,8 @@ ABSURD = float(chi2.ppf(1 - 1e-9, 2))
 CONTRADICTING_SHARE = 0.2
 """Above this share of innovations above `ABSURD` the sightings of a landmark contradict each other; below it they are
 outliers, which a robust estimator outvotes."""
+OUTLYING_SHARE = 0.05
+"""Above this share of innovations above `ABSURD` outliers are named."""
 MOST_NAMED = 5
 NAMELESS = {Outcome.NO_IDENTITY, Outcome.WAITING, Outcome.FORGOTTEN, Outcome.UNFIT}
 """Outcomes of detections whose landmark an estimator does not know."""
@@ -226,6 +228,23 @@ def doubt_of_identities(comparison: Comparison) -> list[str]:
             advice = f"look at identities{named}, then at noise and start"
             lines.append(f"{WARNING}: {run.estimator}{said} {max(wrong.values()):.0f}); {advice}")
     return lines
+
+
+def outliers(comparison: Comparison) -> list[str]:
+    """A warning about runs that used more than `OUTLYING_SHARE` of their detections although these are absurd."""
+    said = []
+    for run in comparison.runs:
+        if (log := run.detections) is not None:
+            squares = normalised_squares(log.innovations, log.innovation_covs)
+            squares = squares[np.isfinite(squares) & [outcome is Outcome.USED for outcome in log.outcomes]]
+            if (far := np.count_nonzero(squares > ABSURD)) > OUTLYING_SHARE * len(squares):
+                said.append(f"{far} of {len(squares)} with {run.estimator}")
+    if not said:
+        return []
+    return [
+        f"{WARNING}: detections that were used are outliers, {', '.join(said)} (as far off as one in a billion should"
+        " be); look at ranges, azimuths and identities, then at noise and start"
+    ]
 
 
 def nameless_landmarks(comparison: Comparison) -> list[str]:

@@ -254,6 +254,33 @@ def test_a_speed_over_twenty_is_in_the_largest_unit_in_which_it_is_no_more_than_
     assert fault.quantity == "DVL: unit"
     assert fault.advice.startswith(f"velocities look {times} times too large (up to {speed:.3g} m/s): {unit}? ")
     assert line_of(fault) == pytest.approx({"scale": scale})
+    assert ("mm/s if the vehicle moves at" in fault.advice) == (unit == "cm/s")
+
+
+SLOW = simulate_mission(MissionOptions(seed=5, duration_s=60.0, frame_rate_hz=2.0, speed_m_s=0.1))
+
+
+@pytest.mark.parametrize("factor", [1.0, 5.0, 30.0, 100.0])
+def test_velocities_that_a_vehicle_has_are_in_another_unit_where_ranges_change_by_a_tenth(factor: float):
+    run = replace(SLOW, dvl=replace(SLOW.dvl, velocity=factor * SLOW.dvl.velocity))
+    measured_m, by_dvl_m = sensor_check.range_changes(run)
+    assert by_dvl_m / measured_m == pytest.approx(factor, rel=0.4)
+    (said,) = [fault.advice for fault in sensor_check.wrong_units(run, LogConfig())] or [""]
+    assert ("cm/s? `scale = 0.01`" in said) == (factor > 10.0)
+    assert ("ranges to landmarks change by" in said) == (factor > 10.0)
+
+
+def test_ranges_tell_nothing_of_units_where_axes_are_wrong_a_fifth_are_outliers_or_landmarks_few():
+    rng, velocity = np.random.default_rng(0), SLOW.dvl.velocity
+    spikes = velocity + 8.0 * (rng.random((len(velocity), 1)) < 0.2)
+    for wrong in (velocity[:, [1, 2, 0]], -velocity, spikes):
+        run = replace(SLOW, dvl=replace(SLOW.dvl, velocity=wrong))
+        assert not sensor_check.wrong_units(run, LogConfig())
+    few = SLOW.detections.rows(slice(0, 15))
+    far = replace(SLOW.dvl, velocity=100.0 * velocity)
+    assert sensor_check.range_changes(replace(SLOW, detections=few)) is None
+    assert not sensor_check.wrong_units(replace(SLOW, detections=few, dvl=far), LogConfig())
+    assert not sensor_check.wrong_units(replace(SLOW, detections=None, dvl=far), LogConfig())
 
 
 @pytest.mark.parametrize(("unit", "factor", "shares"), FORCES)

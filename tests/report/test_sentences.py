@@ -414,3 +414,20 @@ def test_terminal_and_page_say_what_was_refused_and_withheld_and_nothing_where_n
     assert len(lines) == MOST_ROWS_NAMED + 1
     assert lines[-1] == "Warning: isam2 withheld 2 more: runs/isam2/result.json has all"
     assert sentences.withheld_lines(calm) == []
+
+
+def test_outliers_among_used_detections_are_named_from_a_twentieth_on():
+    def said(far: int, outcome: Outcome = Outcome.USED, off_m: float = 1.0) -> list[str]:
+        log = log_of([Outcome.USED] * (100 - far) + [outcome] * far, [0.01] * (100 - far) + [off_m] * far)
+        return sentences.outliers(with_map(IDS, [0.0] * 4, detections=log))
+
+    (line,) = said(6)
+    assert line.startswith("Warning: detections that were used are outliers, 6 of 100 with isam2 (")
+    assert line in printed(with_map(IDS, [0.0] * 4, detections=log_of([Outcome.USED] * 9, [1.0] * 9)), 300).replace(
+        "9 of 9", "6 of 100"
+    )
+    limit_m = SIGMA_M * np.sqrt(sentences.ABSURD)
+    assert not said(5)
+    assert not said(6, Outcome.GATED)
+    assert not said(6, off_m=0.999 * limit_m)
+    assert said(6, off_m=1.001 * limit_m)
