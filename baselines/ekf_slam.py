@@ -117,6 +117,7 @@ class EkfSlam(FilterShell):
         E = np.linalg.inv(np.array(ekf_equations.after(self._x, np.eye(3), np.zeros(3))[2].b))  # W^-1
         self._P[:3, :3] = np.diag(np.square(start.position_sigma_m))
         self._P[3:6, 3:6] = E @ np.diag(np.square(start.rpy_sigma_rad)) @ E.T
+        self._overturned: list[str] = []
         self._P[COMPASS, COMPASS] = calibration.heading.bias_sigma_rad**2
 
     def state(self) -> tuple[int, Floats, Floats]:
@@ -133,12 +134,23 @@ class EkfSlam(FilterShell):
         """
         state = self._x, self._P, self.turned, self.impulse
         k = advance(*state, self.earth, self.port, self.depth_variance, *self.sonar[:3], events, k)
-        if math.cos(self._x[4]) < SINGULAR_COSINE:
+        if math.cos(self._x[4]) >= SINGULAR_COSINE:
+            return k
+        pitch_deg, at_ns = math.degrees(self._x[4]), int(events.start_ns[k])
+        if abs(math.cos(self._x[4])) < SINGULAR_COSINE:
             raise EstimatorError(
-                f"ekf-slam: pitch is {math.degrees(self._x[4]):.2f} deg at {events.start_ns[k]} ns, where the Euler"
-                " angles of its state are singular; use isam2 for this log"
+                f"ekf-slam: pitch is {pitch_deg:.2f} deg at {at_ns} ns, where the Euler angles of its state are"
+                " singular; use isam2 for this log"
             )
-        return k
+        self._overturned = self._overturned or [
+            f"pitch was corrected to {pitch_deg:.0f} deg, first at {at_ns} ns, as no vehicle's is: the filter has lost"
+            " its way, by wrong gyros, velocities or detections; or it needs another estimator, such as isam2"
+        ]
+        return k  # the next prediction reads the angles from the rotation, within a right angle again
+
+    def withheld(self) -> list[str]:
+        """Messages about detections of the gate, and about a pitch beyond 90 degrees."""
+        return [*super().withheld(), *self._overturned]
 
     def correct_plane(self, plane: PlanarMotion) -> None:
         """Update Z, roll and pitch."""

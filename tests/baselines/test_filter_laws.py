@@ -796,3 +796,30 @@ def test_an_innovation_that_a_source_of_motion_lets_be_impossible_is_an_error_wi
     monkeypatch.setattr(Odometry, "used_depths", lambda _, depth: depth)
     with pytest.raises(EstimatorError, match=rf"{kind.name}: between \d+ and \d+ ns .* variances above zero"):
         run(kind, in_a_gap(depths(np.array([later(1.0)]), 1.0, -1e6)))
+
+
+def test_ekf_slam_goes_on_from_a_pitch_beyond_a_right_angle_as_from_the_same_attitude_and_says_so():
+    """As after a correction by a wrong detection: prediction reads all angles from a rotation."""
+    calibration = Calibration(start=Start(rpy_rad=(0.2, 0.4, 3.0), rpy_sigma_rad=(0.01, 0.02, 0.03)))
+    rows = imu(9, (0.01, 0.02, 0.2)), dvl(9, (0.3, 0.1, 0.05))
+    views = seen(later(*np.arange(1.0, 9.0)), range_m=3.0)
+    sequence = Sequence("overturned", calibration, *rows, detections=views)
+    windows = list(sequence.replay(sequence.instants(1.0)))
+    upright, overturned = begun(EkfSlam, calibration), begun(EkfSlam, calibration)
+    for k, window in enumerate(windows):
+        if k == 4:
+            x, P = overturned._x, overturned._P
+            x[3:6] = [x[3] + np.pi, np.pi - x[4], x[5] - np.pi]
+            P[4] *= -1.0
+            P[:, 4] *= -1.0
+            assert upright.withheld() == overturned.withheld() == []
+            depth = Measurements(windows[3].end_ns, depth=depths(np.array([windows[3].end_ns]), 0.0, 1.0))
+            assert_allclose(*(slam.process(depth).world_T_body.matrix() for slam in (upright, overturned)), atol=1e-9)
+        here, there = upright.process(window), overturned.process(window)
+    assert_allclose(there.world_T_body.matrix(), here.world_T_body.matrix(), atol=1e-9)
+    assert_allclose(there.covariance, here.covariance, rtol=1e-6, atol=1e-12)
+    assert_allclose(overturned.state()[1], upright.state()[1], atol=1e-9)
+    assert_allclose(overturned.state()[2], upright.state()[2], rtol=1e-6, atol=1e-12)
+    (line,) = overturned.withheld()
+    assert line.startswith("pitch was corrected to 1")
+    assert upright.withheld() == []
