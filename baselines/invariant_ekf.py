@@ -27,7 +27,8 @@ from baselines.filter import (
 from baselines.invariant_equations import BARE, BETA, BODY, EYE, THETA, UP, InvariantState
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
 from sonar_graph.measurements import Floats
-from sonar_graph.motion import BIASES, MotionSource, bias_sigmas, gyro_bias_of
+from sonar_graph.motion import MotionSource
+from sonar_graph.slam import BIASES, bias_sigmas, gyro_bias_of
 from sonar_graph.slam.models import FLOOR_GATE, doubted, wrap_angle
 
 

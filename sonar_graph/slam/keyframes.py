@@ -20,19 +20,10 @@ from pydantic import Field
 
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.measurements import Depth, Dvl, Floats, Heading, Imu, Ints
-from sonar_graph.motion import (
-    BIASES,
-    COMPASS,
-    HEADING,
-    TILT,
-    MotionSource,
-    PreintegratedMotion,
-    bias_sigmas,
-    by_biases,
-    gyro_bias_of,
-)
+from sonar_graph.motion import MotionSource, PreintegratedMotion
 from sonar_graph.navigation.alignment import gravity_direction
 from sonar_graph.numerics import cross_matrix
+from sonar_graph.slam.biases import BIASES, COMPASS, HEADING, TILT, bias_sigmas, by_biases, gyro_bias_of
 from sonar_graph.slam.models import HUBER_WIDTH, factors
 from sonar_graph.slam.smoother import Changed, Smoother
 from sonar_graph.states import Refusal, RefusedRow

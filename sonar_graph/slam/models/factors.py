@@ -24,9 +24,9 @@ import numpy as np
 from sonar_graph.calibration import Calibration, PlanarMotion
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Floats
-from sonar_graph.motion import ACCEL, COMPASS, HEADING
 from sonar_graph.navigation import PreintegratedMotion
 from sonar_graph.numerics import cross_matrix
+from sonar_graph.slam.biases import ACCEL, COMPASS, HEADING
 from sonar_graph.slam.models.aiding import HUBER_WIDTH, yaw_and_derivative
 from sonar_graph.slam.models.kernels import Robust
 from sonar_graph.slam.models.sonar_model import wrap_angle

@@ -19,7 +19,7 @@ import gtsam
 import numpy as np
 
 from sonar_graph.measurements import Floats
-from sonar_graph.motion import BIASES
+from sonar_graph.slam.biases import BIASES
 
 MAX_STEPS = 50
 """Steps that a descent may try, whether or not they lower the error: each costs a factorisation of the graph."""

@@ -1,0 +1,55 @@
+"""Errors of sensors that last through a run, one vector b of an estimator's state, and what they do to a motion.
+
+::
+
+    b = [b_tilt, b_heading, b_accel, compass, scale],    gyro bias = (I - u u^T) b_tilt + u u^T b_heading
+
+with u the world's up in the body: the bias of the gyros is there twice, as it tilts the body and as it turns its
+heading. Gravity observes the first; what it would tell of the second, through tilts of a few degrees, is less than what
+gyro axes off by a tenth of a degree pretend. Without gravity b_tilt is the whole bias. docs/theory/gravity.md.
+"""
+
+import numpy as np
+
+from sonar_graph.calibration import Calibration
+from sonar_graph.measurements import Floats
+
+TILT, HEADING, ACCEL, COMPASS, SCALE, BIASES = slice(0, 3), slice(3, 6), slice(6, 9), 9, 10, 11
+"""Places in b of the gyros' bias (rad/s), twice, that of the accelerometers (m/s²) and of the compass (rad), and the
+relative scale error of the Doppler log; length of b."""
+
+
+def bias_sigmas(calibration: Calibration) -> tuple[Floats, Floats]:
+    """Standard deviations of b at the start, and densities of its walk, shape (11,) each."""
+    imu, sigmas, walks = calibration.imu, np.zeros(BIASES), np.zeros(BIASES)
+    sigmas[TILT], walks[TILT] = imu.gyro_bias_sigma, imu.gyro_bias_walk_density
+    if calibration.use_gravity:
+        sigmas[HEADING], walks[HEADING] = sigmas[TILT], walks[TILT]
+    sigmas[ACCEL], walks[ACCEL] = imu.accel_bias_sigma, imu.accel_bias_walk_density
+    sigmas[COMPASS], sigmas[SCALE] = calibration.heading.bias_sigma_rad, calibration.dvl.scale_sigma
+    return sigmas, np.where(sigmas > 0, walks, 0.0)
+
+
+def gyro_bias_of(b: Floats, up: Floats) -> Floats:
+    """Gyro bias in body axes, shape (3,), where the world's up lies along ``up`` in the body; zero without gravity."""
+    return np.asarray(b[TILT] + up * (up @ (b[HEADING] - b[TILT])))
+
+
+def by_biases(D: Floats, dR: Floats, dp: Floats, up: Floats, body_p_dvl: Floats) -> Floats:
+    """Derivative of a motion's [theta, rho] by b, shape (6, 11), from that by the gyro bias, ``D``, shape (6, 3).
+
+    By b_heading the body turns about the world's vertical alone, whatever its tilt meanwhile: ``u_j u_j^T D_theta``,
+    with u at the end of the motion. A scale error lengthens the way of the Doppler log, ``dp + dR l - l``.
+
+    Parameters
+    ----------
+    dR, dp
+        Mean of the motion.
+    up
+        The world's up in the body at its start, shape (3,); zero without gravity.
+    """
+    D_b, up_j = np.zeros((6, BIASES)), up @ dR
+    D_b[:3, HEADING], D_b[3:, HEADING] = np.outer(up_j, up_j @ D[:3]), np.outer(D[3:] @ up, up)
+    D_b[:, TILT] = D - D_b[:, HEADING]
+    D_b[3:, SCALE] = (body_p_dvl - dp) @ dR - body_p_dvl
+    return D_b
