@@ -236,7 +236,8 @@ def outliers(comparison: Comparison) -> list[str]:
     for run in comparison.runs:
         if (log := run.detections) is not None:
             squares = normalised_squares(log.innovations, log.innovation_covs)
-            squares = squares[np.isfinite(squares) & [outcome is Outcome.USED for outcome in log.outcomes]]
+            is_used = np.array([outcome is Outcome.USED for outcome in log.outcomes], np.bool_)
+            squares = squares[np.isfinite(squares) & is_used]
             if (far := np.count_nonzero(squares > ABSURD)) > OUTLYING_SHARE * len(squares):
                 said.append(f"{far} of {len(squares)} with {run.estimator}")
     if not said:

@@ -431,3 +431,4 @@ def test_outliers_among_used_detections_are_named_from_a_twentieth_on():
     assert not said(6, Outcome.GATED)
     assert not said(6, off_m=0.999 * limit_m)
     assert said(6, off_m=1.001 * limit_m)
+    assert not sentences.outliers(with_map(IDS, [0.0] * 4, detections=log_of([], [])))
