@@ -23,7 +23,8 @@ import math
 
 import numpy as np
 
-from baselines.filter import GATED, Gate, Motion, SonarModel, admit, correction, far_view, polar_covariance
+from baselines.event_order import Motion
+from baselines.sonar_update import GATED, Gate, SonarModel, admit, correction, far_view, polar_covariance
 from sonar_graph.measurements import Floats
 from sonar_graph.numerics import (
     I3,

@@ -11,21 +11,20 @@ import numpy as np
 
 from baselines import ekf_equations
 from baselines.ekf_equations import COMPASS, LANDMARK, MAP, POSE, correct_depth, correct_up, observe, predict
-from baselines.filter import (
+from baselines.event_order import (
     DEPTH,
     EPOCH,
     FRAME,
     GRAVITY,
     NO_BIAS,
     Events,
-    FilterParams,
-    FilterShell,
-    Gate,
     Motion,
     add_force,
     remove_rate,
     up_at_end,
 )
+from baselines.filter import FilterParams, FilterShell
+from baselines.sonar_update import Gate
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats

@@ -1,38 +1,48 @@
-"""Shell of both landmark filters: the contract, the order of events, and the outcomes of detections.
+"""Shell of both landmark filters: the contract, the way through the events of a call, and outcomes of detections.
 
-A filter's state sits at an epoch, a stamp of the Doppler log. Events happen in the order of their stamps, whatever the
-calls in which measurements arrive: an epoch when it is reached, a depth sample, a heading, a position fix, then the
-detections of a frame. What is measured at an instant is related to the newest epoch reached by then, through a motion
-from rows stamped no later::
-
-    epoch i --- epoch j          predict; then the plane, and gravity where an interval of it ends here
-          i -------- t           depth, heading, position fix, frame, or estimate at the end of the call
-    t' ------ i                  position fix that comes late, by the motion backwards (`FilterShell._use_late`)
-
-Measurements that are related to one epoch over the same gap of the Doppler log share its error. The k-th gets k (k + 1)
-times the motion's covariance: together those of one kind, such as depths or detections, tell no more than one exact
-measurement, ``sum 1 / (k (k + 1)) = 1``.
-
-Far landmarks (`far_view`) and the choices that the paper leaves open: docs/theory/ekf_slam.md, docs/theory/gaps.md.
+A subclass adds the mathematics. Order and meaning of the events: `baselines.event_order`; gate, kernel and landmarks
+that are far from where they are predicted: `baselines.sonar_update`. Choices that the paper leaves open:
+docs/theory/ekf_slam.md.
 """
 
 import math
 from abc import ABC, abstractmethod
-from typing import Any, NamedTuple
+from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
+from baselines.event_order import (
+    DEPTH,
+    END,
+    FIX,
+    FRAME,
+    GRAVITY,
+    HEADING,
+    LONG_AGO,
+    NO_BIAS,
+    NO_DEPTH,
+    NO_GRAVITY,
+    NO_SAMPLES,
+    NO_STAMPS,
+    NO_VIEWS,
+    NOT_STARTED,
+    PLANE,
+    Events,
+    Motion,
+    Views,
+    accepted_rows,
+    in_order,
+    remove_rate,
+)
+from baselines.sonar_update import JUDGED_TOGETHER, NEW, Gate, SonarModel, read
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Depth, Floats, Heading, Ints, LandmarkDetections, Measurements, PositionFixes
-from sonar_graph.motion import Motions, MotionSource, require_source
-from sonar_graph.navigation.alignment import earth_rate_in_world, tilt_sigma, up_direction
-from sonar_graph.numerics import I3, LOWER_LEFT, ZERO, compiled, cross, exp_and_mean, mat, store, vec
-from sonar_graph.slam.landmarks import ACCEPTED, MINIMUM_PROBABILITY, gate_threshold, identify
-from sonar_graph.slam.models import elevation_on_floor
+from sonar_graph.motion import MotionSource, require_source
+from sonar_graph.navigation.alignment import earth_rate_in_world, tilt_sigma
+from sonar_graph.slam.landmarks import MINIMUM_PROBABILITY, identify
 from sonar_graph.states import (
     OUTCOME_NUMBERS,
     CausalEstimates,
@@ -45,6 +55,10 @@ from sonar_graph.states import (
     RefusedRow,
     Trajectory,
 )
+
+KEPT_NS = 20_000_000_000
+"""Age of a position fix up to which rows for it are kept: the smoother's window by default. Up to twice as many are
+kept, since dropping them costs as much as keeping a few."""
 
 
 class FilterParams(Section):
@@ -61,330 +75,6 @@ class FilterParams(Section):
     """Time over which the specific force is averaged for one correction of roll and pitch."""
 
 
-# ------------------------------------------------------------------------------------------------- motions and events
-
-
-class Motion(Motions):
-    """One row of `Motions`: i_T_j with covariance C, derivative D by the gyro bias, and impulse."""
-
-
-@compiled
-def remove_rate(dR: Floats, dp: Floats, D: Floats, impulse: Floats, bias: Floats, earth: Floats) -> None:
-    """Remove a gyro bias and the Earth's rate (frame i, rad/s) from dR, dp and impulse, to first order.
-
-    To gyros the Earth's rate is a bias, the mean of that in both frames, i and j; the specific force is turned by half
-    of what the body is.
-    """
-    R, p, f, rate_i = mat(dR), vec(dp), vec(impulse), vec(earth)
-    rate = vec(bias) + 0.5 * (rate_i + R.T @ rate_i)
-    theta, rho = mat(D) @ rate, mat(D, LOWER_LEFT) @ rate
-    store(R @ exp_and_mean(theta)[0], dR)
-    dp[0], dp[1], dp[2] = p + R @ rho
-    impulse[0], impulse[1], impulse[2] = f + 0.5 * cross(R @ theta, f)
-
-
-@compiled
-def add_force(i_R_j: Floats, impulse: Floats, dR: Floats, more: Floats) -> None:
-    """Continue an interval of gravity by a motion: rotation, and specific force summed up in the frame of its start."""
-    R = mat(i_R_j)
-    impulse[0], impulse[1], impulse[2] = vec(impulse) + R @ vec(more)
-    store(R @ mat(dR), i_R_j)
-
-
-@compiled
-def up_at_end(i_R_j: Floats, impulse: Floats, interval: Floats) -> Floats:
-    """World's up in the body where an interval of `Events.gravity` ends; NaN if not measured. The next one begins."""
-    duration_s = interval[6]
-    for i in range(3):
-        impulse[i] /= duration_s
-    up = up_direction(impulse, i_R_j, interval[:3], interval[3:6], duration_s)
-    store(I3, i_R_j)
-    impulse[0], impulse[1], impulse[2] = ZERO
-    return up
-
-
-EPOCH, PLANE, GRAVITY, DEPTH, HEADING, FIX, FRAME, END = range(8)
-"""Kinds of events; at equal stamps the lower comes first, but plane and gravity right after their epoch."""
-USED, GATED, NEW, LET_IN = (OUTCOME_NUMBERS[o] for o in (Outcome.USED, Outcome.GATED, Outcome.NEW, Outcome.LET_IN))
-OUTLYING, JUDGED_TOGETHER = -2.0 * math.log(0.001), 10
-"""Squared Mahalanobis distance that one right detection in a thousand exceeds, and number of detections of which most
-tell: with a tenth of outliers six of ten are so once in 7,000 times, ``P(Bin(10, 0.1) > 5) = 1.5e-4``."""
-NOT_STARTED, LONG_AGO = int(np.iinfo(np.int64).max), int(np.iinfo(np.int64).min)
-
-
-class Views(NamedTuple):
-    """Detections of a call: range and azimuth z (m, 2) with covariance R_z, innovation e with S (NaN without one)."""
-
-    stamp_ns: Ints
-    landmark: Ints
-    """Number of the landmark in the state; -1 for one that may be new, or far from where it is predicted."""
-    z: Floats
-    R_z: Floats
-    outcome: NDArray[np.int8]
-    """`OUTCOME_NUMBERS`, or ACCEPTED: to be used."""
-    e: Floats
-    S: Floats
-
-
-def accepted_rows(seen_ns: Ints, outcome: NDArray[np.int8], first: int) -> list[int]:
-    """Detections of a frame that are to be used, of which one is given."""
-    return np.flatnonzero((seen_ns == seen_ns[first]) & (outcome == ACCEPTED)).tolist()
-
-
-class Events(NamedTuple):
-    """Events of a call in their order, as columns."""
-
-    stamp_ns: Ints
-    """When they happen; no row stamped later is used."""
-    start_ns: Ints
-    """Newest epoch, at which the motion to an event begins, and the instant at which it ends."""
-    end_ns: Ints
-    kind: Ints
-    row: Ints
-    """Number of the sample in its block, of the interval of gravity, or of the first detection of the frame."""
-    dR: Floats
-    """Columns of `Motions`; NaN over a gap, until that is bridged."""
-    dp: Floats
-    C: Floats
-    D: Floats
-    impulse: Floats
-    has_rate: NDArray[np.bool_]
-    """True where a gyro bias and the Earth's rate are still in a motion."""
-    z_m: Floats
-    """Depths, with their variances; NaN: that of the calibration."""
-    variance_m2: Floats
-    gravity: Floats
-    """Intervals of gravity: velocity of the IMU's point at both ends, duration, and sigma of the tilt, shape (g, 8)."""
-    seen_ns: Ints
-    """Columns of `Views`."""
-    landmark: Ints
-    z: Floats
-    R_z: Floats
-    outcome: NDArray[np.int8]
-    e: Floats
-    S: Floats
-
-
-@compiled
-def in_order(
-    epochs_ns: Ints, reached_ns: Ints, samples: Ints, seen_ns: Ints, outcome: NDArray[np.int8], since_ns: int,
-    end_ns: int, node_ns: int, opened_ns: int, interval_ns: int, is_planar: bool, out: Ints,
-) -> int:  # fmt: skip
-    """Write the first five columns of `Events` into the rows of ``out``, up to the end of a call; their number.
-
-    Parameters
-    ----------
-    samples
-        Stamps, kinds and rows of depths, headings and fixes, in order, shape (3, s).
-    since_ns
-        Samples stamped earlier are passed over, and detections that are not accepted.
-    node_ns, opened_ns, interval_ns
-        Epochs of the state and at which the interval of gravity began, and its least length; 0: no gravity.
-    """
-    n, e, s, r, g, kind, stamp_ns, frame_ns = 0, 0, 0, 0, 0, END, LONG_AGO, LONG_AGO
-    sample_ns = samples[0]
-    while n == 0 or kind != END:
-        if kind == EPOCH and is_planar:
-            kind, until_ns = PLANE, node_ns
-        elif kind <= PLANE and 0 < interval_ns <= node_ns - opened_ns:
-            kind, until_ns, opened_ns, row, g = GRAVITY, node_ns, node_ns, g, g + 1
-        else:
-            while s < len(sample_ns) and sample_ns[s] < since_ns:
-                s += 1
-            while r < len(seen_ns) and (seen_ns[r] == frame_ns or outcome[r] != ACCEPTED):
-                r += 1
-            stamp_ns, until_ns, kind, row = end_ns, end_ns, END, 0
-            if r < len(seen_ns):
-                stamp_ns, until_ns, kind, row = seen_ns[r], seen_ns[r], FRAME, r
-            if s < len(sample_ns) and sample_ns[s] <= stamp_ns:
-                stamp_ns, until_ns, kind, row = sample_ns[s], sample_ns[s], samples[1, s], samples[2, s]
-            if e < len(epochs_ns) and reached_ns[e] <= stamp_ns:
-                stamp_ns, until_ns, kind, row = reached_ns[e], epochs_ns[e], EPOCH, e
-            e, s = e + int(kind == EPOCH), s + int(DEPTH <= kind <= FIX)
-            frame_ns = stamp_ns if kind == FRAME else frame_ns
-        out[0, n], out[1, n], out[2, n], out[3, n], out[4, n] = stamp_ns, node_ns, until_ns, kind, row
-        node_ns, n = until_ns if kind == EPOCH else node_ns, n + 1
-    return n
-
-
-# ------------------------------------------------------------------------------------------------- update, detections
-
-
-@compiled
-def correction(P: Floats, U: Floats, S: Floats, e: Floats) -> Floats:
-    """``K e`` (n,) of an update by m numbers, ``K = P H^T S^-1``, from ``U = H P`` (m, n); P becomes ``P - K S K^T``.
-
-    With ``S = L L^T`` and ``V = L^-1 U`` that is ``P - V^T V``, row by row. Both factors of every product commute, so
-    that P stays symmetric to the last bit. Raises LinAlgError where S is not positive definite.
-    """
-    n, L, V, y, Ke = len(P), S.copy(), U.copy(), e.copy(), np.zeros(len(P))
-    for r in range(len(e)):
-        if not L[r, r] > 0.0:
-            raise np.linalg.LinAlgError("the covariance of an innovation is not positive definite")
-        root = math.sqrt(L[r, r])
-        y[r] /= root
-        for i in range(n):
-            V[r, i] /= root
-        for k in range(r + 1, len(e)):
-            L[k, r] /= root
-            y[k] -= L[k, r] * y[r]
-            for i in range(n):
-                V[k, i] -= L[k, r] * V[r, i]
-            for c in range(r + 1, k + 1):
-                L[k, c] -= L[k, r] * L[c, r]
-        for i in range(n):
-            Ke[i] += V[r, i] * y[r]
-            for j in range(n):
-                P[i, j] -= V[r, i] * V[r, j]
-    return Ke
-
-
-class Gate(NamedTuple):
-    """Doubt about detections: a gate that refuses, and a kernel that widens the noise of outliers."""
-
-    threshold: float
-    """Squared Mahalanobis distance beyond which an innovation is refused."""
-    width: float
-    """Of the kernel, in standard deviations; infinite: none."""
-    outlying: NDArray[np.bool_]
-    """Which of the last detections were outliers, as a ring."""
-    judged: Ints
-    """Number of detections so far, shape (1,)."""
-
-    @classmethod
-    def of(cls, params: FilterParams) -> "Gate":
-        """The gate and kernel of a filter's settings, with nothing judged yet."""
-        threshold, width = gate_threshold(params.gate_probability, 2), params.kernel_width or math.inf
-        return cls(threshold, width, np.zeros(JUDGED_TOGETHER, np.bool_), np.zeros(1, np.int64))
-
-
-@compiled
-def admit(e: Floats, S: Floats, R_z: Floats, gate: Gate) -> tuple[int, Floats]:
-    """Judge an innovation of range and azimuth: `USED`, `GATED` or `LET_IN`, and what the kernel adds to R_z (2, 2).
-
-    The kernel's weights w_i at ``e_i / sqrt(S_ii)`` make ``R_ij / sqrt(w_i w_j)`` of the noise. While most of the last
-    detections are outliers, the filter is wrong, not they: no gate, no kernel. docs/theory/fair_comparison.md.
-    """
-    squared = S[1, 1] * e[0] ** 2 - 2.0 * S[0, 1] * e[0] * e[1] + S[0, 0] * e[1] ** 2
-    squared /= S[0, 0] * S[1, 1] - S[0, 1] ** 2
-    widened, is_inside = np.zeros((2, 2)), squared <= gate.threshold
-    gate.outlying[gate.judged[0] % len(gate.outlying)] = not squared <= OUTLYING
-    gate.judged[0] += 1
-    if 2 * gate.outlying.sum() > len(gate.outlying):
-        return USED if is_inside else LET_IN, widened
-    if not is_inside:
-        return GATED, widened
-    spread = np.empty(2)
-    for i in range(2):
-        spread[i] = math.sqrt(1.0 + e[i] ** 2 / (S[i, i] * gate.width**2))
-    for i in range(2):
-        for j in range(2):
-            widened[i, j] = (spread[i] * spread[j] - 1.0) * R_z[i, j]
-    return USED, widened
-
-
-class SonarModel(NamedTuple):
-    """Sonar mounting and noise, gate, and floor."""
-
-    body_R_sonar: Floats
-    body_p_sonar: Floats
-    gate: Gate
-    aperture_rad: float
-    R_z: Floats
-    """Covariance of range and azimuth where the log has none, shape (2, 2)."""
-    floor_z_m: float
-    """NaN where it is not known."""
-    floor_variance_m2: float
-    body_T_sonar: gtsam.Pose3
-
-    @classmethod
-    def of(cls, calibration: Calibration, params: FilterParams) -> "SonarModel":
-        """The model of a calibration and a filter's settings."""
-        sonar, floor = calibration.sonar, calibration.floor
-        return cls(
-            body_R_sonar=np.ascontiguousarray(sonar.mounting.pose().rotation().matrix()),
-            body_p_sonar=np.array(sonar.mounting.translation_m),
-            gate=Gate.of(params),
-            aperture_rad=sonar.elevation_aperture_rad,
-            R_z=np.diag([sonar.range_sigma_m**2, sonar.azimuth_sigma_rad**2]),
-            floor_z_m=floor.z_m if floor else math.nan,
-            floor_variance_m2=floor.sigma_m**2 if floor else math.nan,
-            body_T_sonar=sonar.mounting.pose(),
-        )
-
-    def elevation_of_new(self, R: Floats, X: Floats, z: Floats) -> float:
-        """Elevation of a new landmark seen from a body: on the floor, or 0 without a floor within the aperture."""
-        world_T_sonar = gtsam.Pose3(gtsam.Rot3(R), X).compose(self.body_T_sonar)
-        return elevation_on_floor(world_T_sonar, z[0], z[1], self.floor_z_m, self.aperture_rad) or 0.0
-
-
-@compiled
-def read(range_m: Floats, azimuth_rad: Floats, logged: Floats, R_z: Floats) -> tuple[Floats, Floats]:
-    """Detections z (m, 2) and their covariances (m, 2, 2): symmetric, and R_z where the log has none."""
-    z, noise = np.empty((len(range_m), 2)), np.empty(logged.shape)
-    for k in range(len(z)):
-        z[k, 0], z[k, 1] = range_m[k], azimuth_rad[k]
-        cross = 0.5 * (logged[k, 0, 1] + logged[k, 1, 0])
-        is_known = not math.isnan(logged[k, 0, 0] + cross + logged[k, 1, 1])
-        noise[k, 0, 0], noise[k, 1, 1] = (logged[k, 0, 0], logged[k, 1, 1]) if is_known else (R_z[0, 0], R_z[1, 1])
-        noise[k, 0, 1] = noise[k, 1, 0] = cross if is_known else R_z[0, 1]
-    return z, noise
-
-
-def polar_covariance(R_z: Floats, aperture_rad: float) -> Floats:
-    """Covariance of range, azimuth and elevation (3, 3); the latter is uniform in the aperture: ``aperture^2 / 12``."""
-    V = np.diag([0.0, 0.0, aperture_rad**2 / 12.0])
-    V[:2, :2] = R_z
-    return V
-
-
-def far_view(
-    missed: Floats, cov: Floats, G_z: Floats, sonar: SonarModel, z: Floats, R_z: Floats
-) -> tuple[int, Floats, Floats, Floats] | None:
-    """Compare a landmark with the point seen, which is linear in both positions; None where `observe` is linear enough.
-
-    With the variances A along the beam and L across it, in the sonar's plane, the linearisation at the predicted place
-    leaves out ``L / (2 r)`` of the range and ``sqrt(L A) / r^2`` of the azimuth. Where that exceeds the noise of the
-    detection, its place ``0 = g(x_v, z, elevation) - p`` counts instead, with an elevation variance ``aperture^2 / 12``
-    and ``r^2 aperture^4 / 320`` for the length of a beam that is not level. docs/theory/gaps.md.
-
-    Parameters
-    ----------
-    missed, cov
-        The point seen at elevation 0 less the landmark, (3,), and its covariance by state and motion, (3, 3).
-    G_z
-        Derivative of the point seen by (range, azimuth, elevation), (3, 3).
-
-    Returns
-    -------
-    Outcome by `admit`; the covariance with the noise of the detection (3, 3); the innovation of range and azimuth (2,)
-    and its covariance.
-    """
-    r, along, across = z[0], G_z[:, 0], G_z[:, 1]
-    A, L_r2 = along @ cov @ along, across @ cov @ across
-    if L_r2 <= 2.0 * r**3 * math.sqrt(R_z[0, 0]) and A * L_r2 <= r**6 * R_z[1, 1]:
-        return None
-    V = polar_covariance(R_z, sonar.aperture_rad)
-    V[0, 0] += r**2 * sonar.aperture_rad**4 / 320.0
-    cov = cov + G_z @ V @ G_z.T
-    cov = 0.5 * (cov + cov.T)
-    B = np.array([along, across / r**2])  # range and azimuth by the point
-    e, S = B @ missed, B @ cov @ B.T
-    outcome, widened = admit(e, S, R_z, sonar.gate)
-    return outcome, cov + G_z[:, :2] @ widened @ G_z[:, :2].T, e, S
-
-
-# ------------------------------------------------------------------------------------------------- the shell
-
-NO_BIAS, NO_STAMPS, NO_DEPTH, NO_GRAVITY = np.zeros(3), np.empty(0, np.int64), np.empty(0), np.empty((0, 8))
-NO_SAMPLES = np.empty((3, 0), np.int64)
-NO_PAIRS, NO_COV = np.empty((0, 2)), np.empty((0, 2, 2))
-NO_VIEWS = Views(NO_STAMPS, NO_STAMPS, NO_PAIRS, NO_COV, np.empty(0, np.int8), NO_PAIRS, NO_COV)
-KEPT_NS = 20_000_000_000
-"""Age of a position fix up to which rows for it are kept: the smoother's window by default. Up to twice as many are
-kept, since dropping them costs as much as keeping a few."""
-
-
 class FilterShell(ABC):
     """Estimator around the mathematics of a filter, which a subclass adds; `name` stands in messages."""
 
@@ -393,7 +83,7 @@ class FilterShell(ABC):
     def __init__(self, calibration: Calibration, odometry: MotionSource, params: FilterParams) -> None:
         require_source(odometry, calibration, f"{type(self).__name__}(calibration, odometry, params)")
         self.calibration, self.odometry = calibration, odometry
-        self.sonar = SonarModel.of(calibration, params)
+        self.sonar = SonarModel.of(calibration, Gate.of(params.gate_probability, params.kernel_width))
         self.port = np.array(calibration.depth.port_m)
         self._minimum_id_probability, earth = params.minimum_id_probability, earth_rate_in_world(calibration)
         self.earth, self._has_rate = np.zeros(3) if earth is None else earth, self.has_bias or earth is not None

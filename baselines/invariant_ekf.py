@@ -9,22 +9,10 @@ import numpy as np
 from pydantic import Field
 
 from baselines import invariant_equations as equations
-from baselines.filter import (
-    DEPTH,
-    EPOCH,
-    GATED,
-    GRAVITY,
-    Events,
-    FilterParams,
-    FilterShell,
-    Motion,
-    add_force,
-    admit,
-    far_view,
-    polar_covariance,
-    up_at_end,
-)  # fmt: skip
+from baselines.event_order import DEPTH, EPOCH, GRAVITY, Events, Motion, add_force, up_at_end
+from baselines.filter import FilterParams, FilterShell
 from baselines.invariant_equations import BARE, BETA, BODY, EYE, THETA, UP, InvariantState
+from baselines.sonar_update import GATED, admit, far_view, polar_covariance
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
 from sonar_graph.measurements import Floats
 from sonar_graph.motion import MotionSource

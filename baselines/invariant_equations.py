@@ -47,7 +47,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from baselines.filter import Motion, SonarModel, correction
+from baselines.event_order import Motion
+from baselines.sonar_update import SonarModel, correction
 from sonar_graph.measurements import Floats
 from sonar_graph.numerics import compiled, exp_and_mean, store, vec
 from sonar_graph.slam import ACCEL, BIASES, COMPASS, SCALE, by_biases

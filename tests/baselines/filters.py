@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from baselines.ekf_slam import EkfSlam
-from baselines.filter import DEPTH, END, EPOCH, GRAVITY, NO_VIEWS, Events, FilterShell, Motion
+from baselines.event_order import DEPTH, END, EPOCH, GRAVITY, NO_VIEWS, Events, Motion
+from baselines.filter import FilterShell
 from baselines.invariant_ekf import InvariantEkf
 from baselines.invariant_equations import InvariantState
 from sonar_graph.calibration import Calibration, DepthCalibration, Mounting, SonarCalibration

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from baselines import ekf_equations, invariant_equations
-from baselines.filter import USED, FilterParams, SonarModel, correction
+from baselines.sonar_update import USED, Gate, SonarModel, correction
 from sonar_graph.calibration import DepthCalibration, PlanarMotion, Start
 from sonar_graph.navigation import Odometry
 from sonar_graph.slam.models.views import locate, range_azimuth
@@ -244,7 +244,7 @@ def test_an_error_moves_the_estimate_by_the_group_s_exponential(angles, turn):
 def test_every_jacobian_is_the_numerical_one(angles, twist, view, turn):
     """Of view, point seen, position, heading, height and up: by xi and motion. The direction of up is the true one."""
     motion = motion_of(twist, C)
-    world, sonar = in_view(angles, motion, view), SonarModel.of(CALIBRATION, FilterParams())
+    world, sonar = in_view(angles, motion, view), SonarModel.of(CALIBRATION, Gate.of(1.0, 0.0))
     state = Invariant.state(world, np.eye(23))
 
     def check(H, H_m, function, angles=()):
@@ -316,7 +316,7 @@ def gauge(axes):
 def test_no_measurement_tells_where_the_world_is_or_which_way_it_is_turned(angles, twist, view):
     """At any estimate, right or wrong: H N = 0 and F N = N with one and the same N. Height and tilt are told."""
     motion = motion_of(twist, np.zeros((6, 6)))
-    world, sonar = in_view(angles, motion, view), SonarModel.of(CALIBRATION, FilterParams())
+    world, sonar = in_view(angles, motion, view), SonarModel.of(CALIBRATION, Gate.of(1.0, 0.0))
     state, known = Invariant.state(world, np.eye(23)), gauge(3) @ gauge(3).T
     H = np.vstack(
         [

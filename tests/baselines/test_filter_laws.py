@@ -15,8 +15,9 @@ from scipy.spatial.transform import Rotation
 from baselines.dead_reckoning import DeadReckoning
 from baselines.ekf_equations import COMPASS
 from baselines.ekf_slam import EkfSlam
-from baselines.filter import DEPTH, END, EPOCH, FIX, FRAME, GRAVITY, HEADING, PLANE, USED, Motion, in_order, remove_rate
+from baselines.event_order import DEPTH, END, EPOCH, FIX, FRAME, GRAVITY, HEADING, PLANE, Motion, in_order, remove_rate
 from baselines.invariant_ekf import InvariantEkf
+from baselines.sonar_update import USED
 from sonar_graph.calibration import (
     Calibration,
     DepthCalibration,

@@ -8,13 +8,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from baselines.filter import (
+from baselines.sonar_update import (
     GATED,
     JUDGED_TOGETHER,
     LET_IN,
     OUTLYING,
     USED,
-    FilterParams,
     Gate,
     SonarModel,
     admit,
@@ -249,7 +248,7 @@ def test_what_no_vehicle_in_reach_sees_is_refused(filter_):
 
 def far(cov, G_z, range_m, noise, missed=(0.0, 0.0, 0.0), aperture_rad=APERTURE_RAD, kernel_width=0.0):
     """`far_view` of a detection with this covariance of range and azimuth; None where it is linear enough."""
-    sonar = SonarModel.of(AHEAD, FilterParams(kernel_width=kernel_width))._replace(aperture_rad=aperture_rad)
+    sonar = SonarModel.of(AHEAD, Gate.of(1.0, kernel_width))._replace(aperture_rad=aperture_rad)
     return far_view(np.array(missed), np.array(cov), G_z, sonar, np.array([range_m, 0.0]), np.array(noise))
 
 
@@ -312,9 +311,9 @@ def test_the_gate_is_an_ellipse_of_a_correlated_innovation(direction):
     assert admitted(1e3 * e, S)[0] == USED
 
 
-def admitted(e, S, R_z=NOISE, **params):
+def admitted(e, S, R_z=NOISE, *, gate_probability=1.0, kernel_width=0.0):
     """Judgement of the first detection by these settings."""
-    return admit(np.array(e), np.array(S), R_z, Gate.of(FilterParams(**params)))
+    return admit(np.array(e), np.array(S), R_z, Gate.of(gate_probability, kernel_width))
 
 
 def test_a_kernel_weighs_range_and_azimuth_each_as_in_the_graph():
@@ -343,7 +342,7 @@ def test_an_outlier_moves_a_filter_with_a_kernel_less_and_what_agrees_as_much(fi
 
 def test_a_gate_refuses_a_few_outliers_and_opens_when_most_are():
     """Of the last ten; it closes again when most are not. One in a thousand right ones is an outlier."""
-    gate, S = Gate.of(FilterParams(gate_probability=0.99)), np.eye(2)
+    gate, S = Gate.of(0.99, 0.0), np.eye(2)
 
     def judge(squared, times=1):
         return [admit(np.array([math.sqrt(squared), 0.0]), S, NOISE, gate) for _ in range(times)]
@@ -354,7 +353,7 @@ def test_a_gate_refuses_a_few_outliers_and_opens_when_most_are():
     assert [outcome for outcome, _ in told] == [USED] * 7 + [GATED] * 5 + [LET_IN] * 3
     assert not np.any([widened for outcome, widened in told if outcome == LET_IN])
     assert [outcome for outcome, _ in judge(1.0, 5) + judge(100.0)] == [USED] * 5 + [GATED]
-    always = Gate.of(FilterParams(gate_probability=0.99))  # outside the gate, but no outliers
+    always = Gate.of(0.99, 0.0)  # outside the gate, but no outliers
     told = [admit(np.array([math.sqrt(OUTLYING - 0.1), 0.0]), S, NOISE, always)[0] for _ in range(20)]
     assert told == [GATED] * 20
 
