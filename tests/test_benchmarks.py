@@ -109,7 +109,7 @@ def test_preintegration_names_its_figures():
     assert found["gtsam_cpp_ratio"] == pytest.approx(found["ours_ns"] / found["gtsam_cpp_ns"], rel=1e-3)
     assert found["gtsam_python_ratio"] > 1
     assert len(found["factor_us"]) == 5
-    assert found["factor_us"]["odometry_with_bias (Python)"] > found["factor_us"]["BetweenFactorPose3 (compiled)"]
+    assert found["factor_us"]["OdometryWithBias (Python)"] > found["factor_us"]["BetweenFactorPose3 (compiled)"]
 
 
 @pytest.mark.slow

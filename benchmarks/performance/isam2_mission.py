@@ -32,7 +32,7 @@ from sonar_graph.navigation import Odometry, PreintegratedMotion
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
 from sonar_graph.slam.isam2 import Isam2
-from sonar_graph.slam.models import elevation_on_floor, factors, locate
+from sonar_graph.slam.models import OdometryWithBias, elevation_on_floor, factors, locate
 from sonar_graph.states import Estimate
 
 FRAME_RATE_HZ = 2.0
@@ -147,7 +147,7 @@ class PlainIsam2WithBias(PlainIsam2):
         self._graph.push_back(factors.bias_prior(B(0), self._calibration.imu.gyro_bias_sigma))
 
     def _odometry_factor(self, motion: PreintegratedMotion) -> gtsam.NonlinearFactor:
-        return factors.odometry_with_bias(X(self._index), X(self._index + 1), B(0), motion)
+        return OdometryWithBias(X(self._index), X(self._index + 1), B(0), motion)
 
 
 def frame_instants(sequence: Sequence) -> np.ndarray:

@@ -36,7 +36,7 @@ from common import make_parser, print_figures, print_table
 
 from sonar_graph.measurements import Dvl, Floats, Imu
 from sonar_graph.navigation import JointPreintegrator
-from sonar_graph.slam.models.factors import odometry_with_bias
+from sonar_graph.slam.models import OdometryWithBias
 from sonar_graph.slam.models.inertial_factors import doppler_odometry, inertial_doppler_odometry
 
 NS = 1_000_000_000
@@ -104,7 +104,7 @@ def factors(rows: tuple[Imu, Dvl]) -> tuple[dict[str, gtsam.NonlinearFactor], gt
         values.insert(key, np.zeros(3))
     noise = gtsam.noiseModel.Gaussian.Covariance(pose.covariance)
     return {
-        "odometry_with_bias (Python)": odometry_with_bias(X(0), X(1), B(1), pose),
+        "OdometryWithBias (Python)": OdometryWithBias(X(0), X(1), B(1), pose),
         "doppler_odometry (Python)": doppler_odometry(X(0), X(1), B(0), motion),
         "inertial_doppler_odometry (Python)": inertial_doppler_odometry(X(0), V(0), X(1), V(1), B(0), motion, GRAVITY),
         "BetweenFactorPose3 (compiled)": gtsam.BetweenFactorPose3(X(0), X(1), pose.i_T_j, noise),

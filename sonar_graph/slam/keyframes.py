@@ -24,7 +24,7 @@ from sonar_graph.motion import MotionSource, PreintegratedMotion
 from sonar_graph.navigation.alignment import gravity_direction
 from sonar_graph.numerics import cross_matrix
 from sonar_graph.slam.biases import BIASES, COMPASS, HEADING, TILT, bias_sigmas, by_biases, gyro_bias_of
-from sonar_graph.slam.models import HUBER_WIDTH, factors
+from sonar_graph.slam.models import HUBER_WIDTH, OdometryWithBias, factors
 from sonar_graph.slam.smoother import Changed, Smoother
 from sonar_graph.states import Refusal, RefusedRow
 
@@ -244,9 +244,10 @@ class Keyframes:
         attitude = world_T_i.rotation().matrix()
         motion = self._motion(start_ns, node_ns, bias, attitude, known_ns)
         self.smoother.add_pose(X(j), world_T_i.compose(motion.i_T_j), node_ns * S_PER_NS)
+        between: gtsam.NonlinearFactor
         if self._bends:
             up_j = self._up(attitude) @ motion.i_T_j.rotation().matrix()
-            between = factors.odometry_with_bias(X(i), X(j), self.bias_keys[i], motion, up_j)
+            between = OdometryWithBias(X(i), X(j), self.bias_keys[i], motion, up_j)
         else:
             between = factors.odometry(X(i), X(j), motion)
         self.smoother.add({"odometry": between})

@@ -6,7 +6,7 @@ import pytest
 from gtsam.symbol_shorthand import B, L, X
 
 from sonar_graph.measurements import Floats
-from sonar_graph.slam.models import factors
+from sonar_graph.slam.models import OdometryWithBias, factors
 from sonar_graph.slam.smoother import Factors
 
 from .graphs import block_of, dense_covariance
@@ -113,7 +113,7 @@ def in_the_basin(
         moved = turn.compose(gtsam.Pose3.Expmap(np.sqrt(np.diag(cov)) * rng.standard_normal(6)))
         motion = motion_of(moved, cov, -np.eye(6, 11) * (np.arange(11) < 3))
         fed.smoother.add_pose(X(k), fed.smoother.values.atPose3(X(k - 1)).compose(moved), float(k))
-        fed.add({"odometry": factors.odometry_with_bias(X(k - 1), X(k), B((k - 1) // bias_steps), motion)})
+        fed.add({"odometry": OdometryWithBias(X(k - 1), X(k), B((k - 1) // bias_steps), motion)})
         if k % bias_steps == 0:
             new = k // bias_steps
             fed.smoother.add_bias(B(new), fed.smoother.values.atVector(B(new - 1)))

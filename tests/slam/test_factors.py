@@ -15,7 +15,7 @@ from sonar_graph.calibration import Calibration, PlanarMotion, Start
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation.joint_preintegration import JointMotion, JointPreintegrator
-from sonar_graph.slam.models import factors
+from sonar_graph.slam.models import OdometryStack, OdometryWithBias, factors
 from sonar_graph.slam.models.inertial_factors import doppler_odometry, inertial_doppler_odometry
 from sonar_graph.slam.models.views import range_azimuth
 from sonar_graph.testing import check_consistent, check_jacobians
@@ -60,7 +60,7 @@ def odometries(pose: gtsam.Pose3, rng: np.random.Generator) -> Made:
         X_j = pose.compose(motion.corrected(bias)).compose(gtsam.Pose3.Expmap(0.3 * spread * rng.standard_normal(6)))
         values = values_of(X0=pose, X1=X_j.compose(gtsam.Pose3(gtsam.Rot3.Rz(turn), np.zeros(3))), B0=bias)
         up = X_j.rotation().matrix()[2] if spread else gtsam.Rot3.RzRyRx(*rng.uniform(-0.4, 0.4, 3)).matrix()[2]
-        yield factors.odometry_with_bias(X(0), X(1), B(0), motion, up), values
+        yield OdometryWithBias(X(0), X(1), B(0), motion, up), values
         if spread == 0.0:  # GTSAM's has the derivative of no error
             values = values_of(X0=pose, X1=pose.compose(motion.i_T_j))
             yield factors.odometry(X(0), X(1), motion), values
@@ -121,7 +121,7 @@ def test_odometry_error_is_what_the_pose_is_off_the_corrected_motion():
     motion, pose, bias = some_motion(2, 0.05), POSES["random"], 0.01 * np.arange(-5.0, 6.0)
     perturbation = np.array([0.01, -0.02, 0.03, 0.1, 0.2, -0.3])
     X_j = pose.compose(motion.i_T_j).compose(gtsam.Pose3.Expmap(motion.D_bias @ (bias - motion.bias)))
-    factor = factors.odometry_with_bias(X(0), X(1), B(0), motion)
+    factor = OdometryWithBias(X(0), X(1), B(0), motion)
     assert np.allclose(factor.unwhitenedError(values_of(X0=pose, X1=X_j, B0=bias)), 0, atol=1e-12)
     off = X_j.compose(gtsam.Pose3.Expmap(perturbation))
     assert np.allclose(factor.unwhitenedError(values_of(X0=pose, X1=off, B0=bias)), perturbation)
@@ -135,7 +135,7 @@ def test_a_bias_of_the_heading_turns_about_the_vertical_wherever_the_estimate_ha
     D_bias = motion.D_bias.copy()
     up_j /= np.linalg.norm(up_j)
     D_bias[:, 3:6] = np.vstack((np.outer(up_j, h), np.zeros((3, 3))))
-    factor = factors.odometry_with_bias(X(0), X(1), B(0), replace(motion, D_bias=D_bias), up_j)
+    factor = OdometryWithBias(X(0), X(1), B(0), replace(motion, D_bias=D_bias), up_j)
     X_j, bias = pose.compose(motion.i_T_j).compose(gtsam.Pose3.Expmap(0.2 * rng.standard_normal(6))), motion.bias
     turned[3:6] = 0.05 * rng.standard_normal(3)
     about_vertical = gtsam.Pose3(gtsam.Rot3.Rz(h @ turned[3:6]).compose(X_j.rotation()), X_j.translation())
@@ -154,7 +154,7 @@ def test_odometry_keeps_the_correlations_of_the_shortest_motion(sigma: float):
     off = sigma * np.array([0.3, -0.2, 0.1, 1.0, 2.0, -1.0])
     values = values_of(X0=pose, X1=pose.compose(motion.i_T_j).compose(gtsam.Pose3.Expmap(off)), B0=motion.bias)
     expected = 0.5 * off @ np.linalg.solve(motion.covariance, off)
-    for factor in factors.odometry(X(0), X(1), motion), factors.odometry_with_bias(X(0), X(1), B(0), motion):
+    for factor in factors.odometry(X(0), X(1), motion), OdometryWithBias(X(0), X(1), B(0), motion):
         assert factor.error(values) == pytest.approx(expected, rel=1e-5)
     start = Start(position_sigma_m=(2e-5, 1e-5, 3e-5), rpy_sigma_rad=(1e-5,) * 3, rpy_rad=(0.4, -0.6, 2.2))
     moved = start.pose().compose(gtsam.Pose3(gtsam.Rot3(), start.pose().rotation().unrotate(np.array([2e-5, 0, 0]))))
@@ -430,3 +430,26 @@ def test_twelve_rows_need_a_measured_specific_force():
         made(unfelt, True, False)
     assert np.isfinite(made(unfelt, False, False).unwhitenedError(fitting(motion, 1, 0.1))).all()
     made(motion, True, False)
+
+
+def test_odometry_factors_together_are_what_each_is():
+    """Errors and derivatives, of small and large residuals and corrections, with poses and biases in common."""
+    rng = np.random.default_rng(5)
+    values, made = gtsam.Values(), []
+    for b in range(3):
+        values.insert(B(b), 0.3 * rng.standard_normal(11))
+    for k in range(40):
+        spread = 10.0 ** rng.uniform(-6, 0.3)
+        motion = some_motion(k, 0.05)
+        values.insert(X(k), gtsam.Pose3.Expmap(rng.standard_normal(6)))
+        if k % 2:
+            X_j = values.atPose3(X(k - 1)).compose(motion.corrected(values.atVector(B(k % 3))))
+            values.update(X(k), X_j.compose(gtsam.Pose3.Expmap(spread * rng.standard_normal(6))))
+        if k:
+            up = values.atPose3(X(k)).rotation().matrix()[2] if k % 3 else np.zeros(3)
+            made.append(OdometryWithBias(X(k - 1), X(k), B(k % 3), motion, up))
+    stack = OdometryStack(made)
+    assert stack.error(values) == pytest.approx(sum(factor.error(values) for factor in made), rel=1e-12)
+    for found, factor in zip(stack.linear_factors(values), made, strict=True):
+        mine, theirs = found.augmentedInformation(), factor.linearize(values).augmentedInformation()
+        assert mine == pytest.approx(theirs, rel=1e-9, abs=1e-9 * np.abs(theirs).max())

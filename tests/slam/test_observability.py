@@ -282,7 +282,8 @@ def test_a_keyframe_without_odometry_is_named_with_what_is_missing():
 def test_a_sighting_that_places_no_landmark_is_withheld_and_its_landmark_begins_with_the_next(monkeypatch, history):
     """Once, a landmark's first sighting goes without what is said of its direction and height.
 
-    Cholesky fails with it and the window is begun anew: causal estimates agree to a few hundredths of their sigmas.
+    Cholesky fails with it and the window is begun anew: causal estimates agree to a few hundredths of their sigmas. The
+    batch solutions start at different windows then, and each stops at a step that gains little: 0.05 mm.
     """
     ids, stamps = mission().detections.most_probable()[0], mission().detections.stamps_ns
     row = max(int(np.argmax(ids == landmark)) for landmark in set(ids.tolist()) if np.sum(ids == landmark) > 5)

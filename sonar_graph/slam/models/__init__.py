@@ -2,6 +2,7 @@
 
 # fmt: off
 from sonar_graph.slam.models.aiding import HUBER_WIDTH, doubted, yaw_and_derivative
+from sonar_graph.slam.models.biased_odometry import OdometryStack, OdometryWithBias
 from sonar_graph.slam.models.kernels import GaussianKernel, Kernel, KernelParams, Robust, RobustKernel
 from sonar_graph.slam.models.prediction import PredictedView, Source
 from sonar_graph.slam.models.sonar_model import (
@@ -10,7 +11,7 @@ from sonar_graph.slam.models.sonar_model import (
 from sonar_graph.slam.models.views import locate, locate_jacobians, range_azimuth_jacobians
 
 __all__ = [
-    "FLOOR_GATE", "GaussianKernel", "HUBER_WIDTH", "Kernel", "KernelParams", "PredictedView", "Robust",
-    "RobustKernel", "Source", "doubted", "elevation_on_floor", "locate", "locate_jacobians", "project",
-    "range_azimuth_jacobians", "sonar_point", "sonar_point_jacobian", "wrap_angle", "yaw_and_derivative",
+    "FLOOR_GATE", "GaussianKernel", "HUBER_WIDTH", "Kernel", "KernelParams", "OdometryStack", "OdometryWithBias",
+    "PredictedView", "Robust", "RobustKernel", "Source", "doubted", "elevation_on_floor", "locate", "locate_jacobians",
+    "project", "range_azimuth_jacobians", "sonar_point", "sonar_point_jacobian", "wrap_angle", "yaw_and_derivative",
 ]

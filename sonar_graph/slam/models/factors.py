@@ -8,8 +8,8 @@
                    └── range, azimuth ── L7 ── floor prior
     depth, gravity direction and the planar constraint: one keyframe each
 
-All but the odometry factor with a gyro bias are GTSAM's own (compiled) factors. Range and azimuth are two factors, so
-that elevation stays unknown: ``RangeFactorWithTransform3D``, and for azimuth a camera whose optical axis lies in the
+All but those that depend on biases (`biased_odometry`) are GTSAM's own (compiled) factors. Range and azimuth are two:
+elevation stays unknown. ``RangeFactorWithTransform3D``, and for azimuth a camera whose optical axis lies in the
 sonar's fan plane along the measured azimuth, with the equidistant projection (Kannala and Brandt, IEEE PAMI 28(8),
 2006): a direction at angle t from the axis has an image point at distance t from its centre. Its horizontal coordinate
 is ``azimuth - measured`` at elevation 0, times ``e / tan(e)`` at a small elevation e (0.995 at 7 degrees); the vertical
@@ -26,7 +26,7 @@ from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Floats
 from sonar_graph.navigation import PreintegratedMotion
 from sonar_graph.numerics import cross_matrix
-from sonar_graph.slam.biases import ACCEL, COMPASS, HEADING
+from sonar_graph.slam.biases import ACCEL, COMPASS
 from sonar_graph.slam.models.aiding import HUBER_WIDTH, yaw_and_derivative
 from sonar_graph.slam.models.kernels import Robust
 from sonar_graph.slam.models.sonar_model import wrap_angle
@@ -98,49 +98,6 @@ def odometry(key_i: int, key_j: int, motion: PreintegratedMotion) -> gtsam.Nonli
     """Relative pose from preintegrated gyro and DVL where the gyro has no bias to estimate."""
     noise = gaussian(motion.covariance)
     return gtsam.BetweenFactorPose3(key_i, key_j, motion.i_T_j, noise)
-
-
-def odometry_with_bias(
-    key_i: int, key_j: int, bias_key: int, motion: PreintegratedMotion, up_j: Floats = ORIGIN
-) -> gtsam.NonlinearFactor:
-    """Relative pose from preintegrated gyro and DVL, and the biases b, of which ``D_bias`` has a column each.
-
-    Error ``Log(corrected(b)^-1 X_i^-1 X_j Exp(-psi u))``, shape (6,), with ``corrected(b) = i_T_j Exp(D (b - bias))``.
-    D is D_bias without the turn by b_heading, ``psi = h (b_heading - its bias)``, which is about the world's vertical u
-    in body j as estimated: about a fixed axis of the body it would be a tilt once the estimate tilts, and gravity tell.
-
-    ``up_j``: u when the motion was set, shape (3,), along which ``D_bias`` has that turn; zero without gravity.
-    """
-    inverse_mean, by_turn, D_bias = motion.i_T_j.inverse(), np.zeros(motion.D_bias.shape[1]), motion.D_bias.copy()
-    by_turn[HEADING] = up_j @ D_bias[:3, HEADING]
-    D_bias[:3] -= np.outer(up_j, by_turn)
-    known: tuple[bytes, gtsam.Pose3, Floats] | None = None  # biases are linearised anew far more seldom than poses
-
-    def corrected(bias: Floats) -> tuple[gtsam.Pose3, Floats]:
-        nonlocal known
-        if known is None or known[0] != bias.tobytes():
-            correction = D_bias @ (bias - motion.bias)
-            inverse = gtsam.Pose3.Expmap(-correction).compose(inverse_mean)
-            known = bias.tobytes(), inverse, gtsam.Pose3.ExpmapDerivative(correction) @ D_bias
-        return known[1:]
-
-    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:
-        X_j, bias = values.atPose3(key_j), values.atVector(bias_key)
-        up, turn_rad = X_j.rotation().matrix()[2], by_turn.dot(bias - motion.bias)
-        turn = gtsam.Rot3.Expmap(-turn_rad * up)
-        i_T_j = values.atPose3(key_i).between(X_j).compose(gtsam.Pose3(turn, ORIGIN))
-        inverse_corrected, D_correction = corrected(bias)
-        E = inverse_corrected.compose(i_T_j)
-        e = gtsam.Pose3.Logmap(E)
-        if jacobians is not None:
-            D_log = gtsam.Pose3.LogmapDerivative(e)
-            jacobians[0] = -D_log.dot(i_T_j.inverse().AdjointMap())
-            jacobians[1] = np.hstack((D_log[:, :3], D_log[:, 3:].dot(turn.matrix().T)))
-            jacobians[2] = -D_log.dot(E.inverse().AdjointMap()).dot(D_correction)
-            jacobians[2] -= np.outer(D_log[:, :3].dot(up), by_turn)
-        return e
-
-    return gtsam.CustomFactor(gaussian(motion.covariance), [key_i, key_j, bias_key], error)
 
 
 def landmark_sighting(

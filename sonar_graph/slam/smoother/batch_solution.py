@@ -10,10 +10,12 @@ sightings say where to start it instead (docs/theory/isam2.md).
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
+from typing import Any, Protocol
 
 import gtsam
 import numpy as np
@@ -30,6 +32,81 @@ LEAST_DECREASE = 1e-5
 FIRST_DAMPING = 1e-9
 DAMPING_FACTOR = 10.0
 MAX_DAMPING = 1e9
+MOVING = 0.1
+"""Share of the largest move of a keyframe in a step from which on another one moves much."""
+FEW = 0.25
+"""Share of keyframes up to which they are solved for by themselves."""
+MAX_STEPS_OF_PART = 20
+HELD = 1e-6
+"""Standard deviation of what is held meanwhile, rad or m."""
+
+
+class Stack(Protocol):
+    """Many factors of one kind, evaluated as arrays."""
+
+    def __init__(self, factors: Sequence[Any]) -> None: ...
+
+    def error(self, values: gtsam.Values) -> float:
+        """Half the sum of squared whitened errors."""
+
+    def linear_factors(self, values: gtsam.Values) -> list[gtsam.JacobianFactor]:
+        """What linearising each of them gives."""
+
+
+class StackedGraph:
+    """A graph, of which factors in Python that can be are evaluated together: those whose class has a `Stack`."""
+
+    def __init__(self, graph: gtsam.NonlinearFactorGraph) -> None:
+        self.factors = [graph.at(i) for i in range(graph.size())]
+        self._rest = gtsam.NonlinearFactorGraph()
+        kinds: dict[type[Stack], list[gtsam.NonlinearFactor]] = defaultdict(list)
+        for factor in self.factors:
+            if kind := getattr(factor, "Stack", None):
+                kinds[kind].append(factor)
+            else:
+                self._rest.add(factor)
+        self._stacks = [kind(members) for kind, members in kinds.items()]
+
+    def error(self, values: gtsam.Values) -> float:
+        """Half the sum of squared errors."""
+        return float(self._rest.error(values)) + sum(stack.error(values) for stack in self._stacks)
+
+    def linearize(self, values: gtsam.Values) -> gtsam.GaussianFactorGraph:
+        """All factors, linearised."""
+        linear = self._rest.linearize(values)
+        for factor in (factor for stack in self._stacks for factor in stack.linear_factors(values)):
+            linear.push_back(factor)
+        return linear
+
+    @cached_property
+    def _on(self) -> dict[int, list[int]]:
+        """Places of the factors on each keyframe."""
+        places = defaultdict(list)
+        for i, factor in enumerate(self.factors):
+            for key in filter(is_pose, list(factor.keys())):
+                places[key].append(i)
+        return places
+
+    def unsettled(self, step: gtsam.VectorValues) -> list[int]:
+        """Keyframes that a step moves at least a tenth as far as the one that it moves most, where these are few."""
+        moves = {key: np.abs(step.at(key)).max() for key in self._on}
+        least = MOVING * max(moves.values(), default=0.0)
+        found = [key for key, move in moves.items() if move > least]
+        return found if len(found) < FEW * len(moves) else []
+
+    def around(self, keyframes: list[int], values: gtsam.Values) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+        """Factors on some keyframes, with the values of their variables, of which all others are held."""
+        part, moving = gtsam.NonlinearFactorGraph(), set(keyframes)
+        for i in sorted({i for key in keyframes for i in self._on[key]}):
+            part.add(self.factors[i])
+        keys = list(part.keyVector())
+        some = picked(values, keys)
+        for key in keys:
+            if key not in moving:
+                n = tangent_size(key)
+                tight = gtsam.JacobianFactor(key, np.eye(n) / HELD, np.zeros(n), gtsam.noiseModel.Unit.Create(n))
+                part.add(gtsam.LinearContainerFactor(tight, some))
+        return part, some
 
 
 def solve(graph: gtsam.NonlinearFactorGraph, initial: gtsam.Values) -> gtsam.Values:
@@ -38,23 +115,34 @@ def solve(graph: gtsam.NonlinearFactorGraph, initial: gtsam.Values) -> gtsam.Val
 
 
 def descended(
-    graph: gtsam.NonlinearFactorGraph, initial: gtsam.Values, most_steps: int
+    graph: gtsam.NonlinearFactorGraph,
+    initial: gtsam.Values,
+    most_steps: int,
+    least_decrease: float | None = None,
 ) -> tuple[gtsam.Values, float, int]:
     """Levenberg–Marquardt from ``initial``, in at most so many steps.
 
     Minimises the sum of squared whitened (and robustly weighted) errors. Damping multiplies the identity; it starts
     negligible (a Gauss–Newton step) and grows tenfold while a step does not lower the error (Nocedal and Wright,
     Numerical Optimization, section 10.3). A step is doubled while that lowers the error more: those of a robust
-    kernel fall short, since its weights are held while a step is solved for.
+    kernel fall short, since its weights are held while a step is solved for. After a step by which few keyframes move
+    much these are solved for, with all else held, before the next step of all.
+
+    Parameters
+    ----------
+    least_decrease
+        Stop when an iteration lowers the error by less; None: `RELATIVE_DECREASE` of it, or `LEAST_DECREASE`. Where it
+        is given no part is solved for by itself.
 
     Returns
     -------
     The values reached, their error, and the number of steps that were tried.
     """
-    values, error = initial, graph.error(initial)
+    stacked = StackedGraph(graph)
+    values, error = initial, stacked.error(initial)
     damping, ordering, tried = FIRST_DAMPING, None, 0
     while tried < most_steps:
-        linear = graph.linearize(values)
+        linear = stacked.linearize(values)
         if ordering is None:
             ordering = gtsam.Ordering.ColamdGaussianFactorGraph(linear)
         candidate, candidate_error = values, np.inf
@@ -63,7 +151,7 @@ def descended(
             try:
                 step = damped_step(linear, values, damping, ordering)
                 candidate = values.retract(step)
-                candidate_error = graph.error(candidate)
+                candidate_error = stacked.error(candidate)
             except RuntimeError:  # GTSAM: indeterminate for this damping
                 candidate_error = np.inf
             if candidate_error < error:
@@ -75,14 +163,20 @@ def descended(
         while True:  # weights that are made anew with each step make steps too short
             step = step.scale(2.0)
             further = values.retract(step)
-            further_error = graph.error(further)
+            further_error = stacked.error(further)
             if not further_error < candidate_error:
                 break
             candidate, candidate_error = further, further_error
         decrease = error - candidate_error
         values, error = candidate, candidate_error
-        if decrease <= max(RELATIVE_DECREASE * error, LEAST_DECREASE):
+        least = max(RELATIVE_DECREASE * error, LEAST_DECREASE) if least_decrease is None else least_decrease
+        if decrease <= least:
             break
+        if least_decrease is None and (moving := stacked.unsettled(step)):
+            part = descended(*stacked.around(moving, values), MAX_STEPS_OF_PART, least)[0]
+            values = gtsam.Values(values)
+            values.update(picked(part, moving))
+            error = stacked.error(values)
     return values, error, tried
 
 
@@ -126,7 +220,7 @@ class Marginals:
     """
 
     def __init__(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
-        self._linear, self._values = graph.linearize(values), values
+        self._linear, self._values = StackedGraph(graph).linearize(values), values
         self._by_cholesky: gtsam.Marginals | None = None
         with suppress(RuntimeError):
             self._by_cholesky = gtsam.Marginals(self._linear, values)

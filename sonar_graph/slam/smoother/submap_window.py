@@ -27,7 +27,7 @@ SETTLED = 0.002
 """Decrease of the error (half a sum of squares) a keyframe, by a step of those of a submap, up to which they rest."""
 AT_ONCE = 100.0
 """Shift, in thresholds of relinearisation, from which on the next update relinearises."""
-MOST = 100
+MOST = 50
 """Submaps from which on neighbours are joined."""
 MOST_ROWS = 120
 """Rows of what a joined submap shares with the rest, at most: it is dense."""
@@ -43,7 +43,9 @@ class Submap:
     """Keys of its keyframes, in the order of time."""
     factors: dict[Factor, None]
     values: gtsam.Values
-    """Estimates of its keyframes when it was last linearised."""
+    """Its keyframes where it was last linearised."""
+    net: gtsam.GaussianBayesNet | None = None
+    """Its keyframes given what it shares with the rest, both as steps from where it was linearised."""
     summary: SubmapFactor | None = None
     marginals: Sequence[Factor] = ()
     """What stands for it elsewhere: the factor of the summary; absolute where no pose of it stays."""
@@ -54,12 +56,13 @@ class Submap:
     """The submap of which it is a part."""
 
     def present(self, estimate: gtsam.Values) -> gtsam.Values:
-        """Its keyframes, moved with the frame of the submap."""
-        if self.summary is None:
+        """Its keyframes at their best, given the estimate of what stays, moved with the frame of the submap."""
+        if self.summary is None or self.net is None:
             return self.values
-        motion, moved = self.summary.motion(estimate), gtsam.Values()
+        motion, step = self.summary.motion(estimate), self.net.optimize(self.summary.step(estimate))
+        moved = gtsam.Values()
         for key in self.interior:
-            moved.insert(key, motion.compose(self.values.atPose3(key)))
+            moved.insert(key, motion.compose(self.values.atPose3(key).retract(step.at(key))))
         return moved
 
     def is_stale(self, estimate: gtsam.Values) -> bool:
@@ -82,7 +85,7 @@ class Submap:
         values.insert(interior)
         net, rest = graph.linearize(values).eliminatePartialSequential(order, gtsam.EliminateQR)
         self.is_settled = net.error(values.zeroVectors()) <= SETTLED * len(self.interior)
-        self.values = interior.retract(net.optimize(step))
+        self.values, self.net, self.summary = interior, net, None
         poses = [key for key in kept if is_pose(key)]
         if poses:
             keys = [poses[0], *(key for key in kept if key != poses[0])]
@@ -96,7 +99,7 @@ class Submap:
             self.summary = SubmapFactor(keys, A, b, values)
             self.marginals = [self.summary.factor()]
         else:
-            self.summary = None
+            self.values, self.net = interior.retract(net.optimize(step)), None
             self.marginals = [gtsam.LinearContainerFactor(rest.at(i), values) for i in range(rest.size())]
 
 

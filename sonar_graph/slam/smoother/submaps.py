@@ -141,6 +141,16 @@ class SubmapFactor:
         moved_m = self._inverse_start.transformFrom(frame.translation())
         return np.concatenate(parts), np.array([rigid[2], moved_m[0], moved_m[1]]), frame
 
+    def step(self, values: gtsam.Values) -> gtsam.VectorValues:
+        """Perturbations in the moved frame, as GTSAM's steps from where it was linearised."""
+        xi, _, _ = self.deviation(values)
+        R, step, n = self._start.rotation().matrix(), gtsam.VectorValues(), 0
+        for key in self.order:
+            part = xi[n : n + tangent_size(key)]
+            step.insert(key, R @ part if key in self._points else part)
+            n += len(part)
+        return step
+
     def _error(self, _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:
         xi, rigid, frame = self.deviation(values)
         if jacobians is not None:
