@@ -276,6 +276,12 @@ def test_ranges_tell_nothing_of_units_where_axes_are_wrong_a_fifth_are_outliers_
     for wrong in (velocity[:, [1, 2, 0]], -velocity, spikes):
         run = replace(SLOW, dvl=replace(SLOW.dvl, velocity=wrong))
         assert not sensor_check.wrong_units(run, LogConfig())
+    astern = replace(SLOW, dvl=replace(SLOW.dvl, velocity=-100.0 * velocity))
+    assert sensor_check.wrong_units(astern, LogConfig())
+    sonar = SLOW.calibration.sonar.model_copy(update={"range_sigma_m": 0.05})
+    coarse = replace(SLOW.detections, range_m=np.full(len(SLOW.detections), 2.0))
+    calibration = SLOW.calibration.model_copy(update={"sonar": sonar})
+    assert not sensor_check.wrong_units(replace(SLOW, detections=coarse, calibration=calibration), LogConfig())
     few = SLOW.detections.rows(slice(0, 15))
     far = replace(SLOW.dvl, velocity=100.0 * velocity)
     assert sensor_check.range_changes(replace(SLOW, detections=few)) is None
