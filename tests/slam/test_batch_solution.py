@@ -11,6 +11,7 @@ from sonar_graph.slam.smoother.batch_solution import (
     Marginals,
     Sightline,
     Sightlines,
+    StackedGraph,
     placed_anew,
     solve,
     solve_in_sight,
@@ -19,7 +20,7 @@ from sonar_graph.slam.smoother.batch_solution import (
 
 from .fed import FOREVER_S, SONAR, in_the_basin
 from .graphs import gtsams_solution
-from .made import graph_of, huber, plain, pose_prior, scattered, smoother_with, values_of
+from .made import graph_of, huber, isotropic, plain, pose_prior, scattered, smoother_with, values_of
 
 
 def round_trip(seed: int, kernel=plain) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
@@ -205,3 +206,33 @@ def test_a_solution_tries_no_more_steps_than_two_descents_may(most, monkeypatch)
     bounded = solve_in_sight(graph, initial, lines)
     assert most <= len(tried) <= 2 * most < needed
     assert graph.error(freely) < graph.error(bounded) < graph.error(initial)
+
+
+def test_what_still_moves_is_solved_for_by_itself_to_the_same_solution(monkeypatch: pytest.MonkeyPatch):
+    """One keyframe of forty starts far off; of the others none moves while it is solved for."""
+    step, noise = gtsam.Pose3(gtsam.Rot3.Rz(0.1), np.array([1.0, 0.0, 0.0])), isotropic(6, 0.1)
+    graph, values, pose = graph_of([pose_prior(X(0), gtsam.Pose3(), 0.1)]), gtsam.Values(), gtsam.Pose3()
+    for k in range(40):
+        values.insert(X(k), pose)
+        pose = pose.compose(step)
+        if k:
+            graph.add(gtsam.BetweenFactorPose3(X(k - 1), X(k), step, noise))
+    values.update(X(20), values.atPose3(X(20)).compose(gtsam.Pose3(gtsam.Rot3.Rz(1.5), np.array([2.0, 1.0, 0.0]))))
+    around, parts = StackedGraph.around, []
+
+    def watched(stacked: StackedGraph, keyframes: list[int], at: gtsam.Values):
+        part, some = around(stacked, keyframes, at)
+        solved = batch_solution.descended(part, some, 20, 1e-9)[0]
+        held = [key for key in list(some.keys()) if key not in keyframes]
+        assert all(solved.atPose3(key).equals(some.atPose3(key), 1e-6) for key in held)
+        parts.append(keyframes)
+        return part, some
+
+    monkeypatch.setattr(StackedGraph, "around", watched)
+    found = solve(graph, values)
+    assert X(20) in parts[0]
+    assert len(parts[0]) < 10
+    monkeypatch.setattr(batch_solution, "FEW", 0.0)
+    parts.clear()
+    assert found.equals(solve(graph, values), 1e-5)
+    assert not parts
