@@ -38,6 +38,7 @@ from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 from sonar_graph.slam.landmarks import ACCEPTED
 from sonar_graph.states import CausalEstimates, Estimate, Outcome, Refusal
 from sonar_graph.testing import check_consistent
+from sonar_graph.testing.numerical import central_differences
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks" / "performance"
 T0_NS = 1_700_000_000 * NS_PER_S
@@ -460,6 +461,25 @@ def test_aiding_in_a_gap_shares_the_error_of_the_motion(kind):
         slam.process(window)
     walked = sequence.calibration.dvl.velocity_walk_density**2 * 7.0**3 / 3
     assert 1 / (1 + 1 / walked) < height_and_tilt(slam)[1] < 0.9
+
+
+def test_a_late_fix_has_the_motion_backwards_with_its_covariance_and_derivative(monkeypatch):
+    """By differences of the inverse."""
+    told, (gyro, doppler), nothing = [], circle(), np.zeros(6)
+    monkeypatch.setattr(EkfSlam, "_fix", lambda _, motion, *__: told.append(motion))
+    slam, end_ns, fix_ns = begun(EkfSlam, circle_calibration()), later(10.0), later(6.03)
+    slam.process(Measurements(end_ns, gyro.between(T0_NS - 1, end_ns), doppler.between(T0_NS - 1, end_ns)))
+    late = PositionFixes(np.array([fix_ns]), np.zeros((1, 3)), np.eye(3)[None])
+    slam.process(Measurements(end_ns, positions=late))
+    forth, (back,) = slam.odometry.motion(fix_ns, slam.node_ns, np.zeros(3)), told
+    inverse = forth.i_T_j.inverse()
+    assert_allclose(back.dR, inverse.rotation().matrix(), atol=1e-12)
+    assert_allclose(back.dp, inverse.translation(), atol=1e-12)
+    moved = lambda eps: inverse.localCoordinates(forth.i_T_j.retract(eps).inverse())  # noqa: E731
+    J = central_differences(moved, nothing)
+    assert_allclose(back.C, J @ forth.covariance @ J.T, rtol=1e-6, atol=1e-12)
+    assert_allclose(back.D, J @ forth.D_bias, atol=1e-6)
+    assert np.abs(back.C - forth.covariance).max() > 1e-6
 
 
 def without(bias, earth, dR, dp, D, impulse):
