@@ -8,7 +8,8 @@ from gtsam.symbol_shorthand import B, L, X
 from sonar_graph.slam.smoother import submap_window
 from sonar_graph.slam.smoother.batch_solution import picked
 from sonar_graph.slam.smoother.submap_window import Submap
-from sonar_graph.slam.smoother.submaps import Attitude, SubmapFactor, level_frame
+from sonar_graph.slam.smoother.submaps import SubmapFactor, turn_from, yaw_from
+from sonar_graph.testing import check_derivative
 
 from .fed import Fed, assert_is_least_squares, in_the_basin, on_the_rail
 from .graphs import off_sigmas
@@ -19,9 +20,10 @@ KEYS = [X(3), X(9), L(1), L(2), B(0)]
 SIZES = {X(3): 6, X(9): 6, L(1): 3, L(2): 3, B(0): 3}
 
 
-def some_values(seed: int, spread: float = 1.0) -> gtsam.Values:
-    rng = np.random.default_rng(seed)
-    poses = {f"X{k}": gtsam.Pose3.Expmap(spread * rng.normal(size=6) * [0.4, 0.4, 2.0, 3, 3, 3]) for k in (3, 9)}
+def some_values(seed: int, roll_rad: float = 0.0) -> gtsam.Values:
+    rng, rolled = np.random.default_rng(seed), gtsam.Pose3(gtsam.Rot3.Rx(roll_rad), np.zeros(3))
+    moved = {k: gtsam.Pose3.Expmap(rng.normal(size=6) * [0.4, 0.4, 2.0, 3, 3, 3]) for k in (3, 9)}
+    poses = {f"X{k}": pose.compose(rolled) for k, pose in moved.items()}
     return values_of(**poses, L1=5 * rng.normal(size=3), L2=5 * rng.normal(size=3), B0=0.01 * rng.normal(size=3))
 
 
@@ -47,11 +49,12 @@ def test_where_it_was_made_a_summary_is_the_marginal():
     assert found_b == pytest.approx(b, abs=1e-12)
 
 
+@pytest.mark.parametrize("roll_rad", [0.0, 3.0])
 @pytest.mark.parametrize("seed", range(4))
-def test_elsewhere_its_derivative_is_that_of_its_error(seed):
-    """Frame, poses, landmarks and biases, far from where it was made; with an absolute part."""
-    _, _, factor = random_summary(some_values(0))
-    values = some_values(seed + 1)
+def test_elsewhere_its_derivative_is_that_of_its_error(seed, roll_rad):
+    """Frame, poses, landmarks and biases, far from where it was made, and upside down; with an absolute part."""
+    _, _, factor = random_summary(some_values(0, roll_rad))
+    values = some_values(seed + 1, roll_rad)
     found, _ = factor.linearize(values).jacobian()
     columns = []
     for key, size in SIZES.items():
@@ -89,8 +92,8 @@ def test_a_turn_about_the_vertical_leaves_the_tilt_as_it_was():
         after, up = before.compose(tilt), before.matrix()[2]
         for turn_rad in (-2.0, 0.4):
             wound = gtsam.Rot3.Rz(turn_rad).compose(after)
-            expected = Attitude(before).turn_to(Attitude(after))[0] + turn_rad * up
-            assert Attitude(before).turn_to(Attitude(wound))[0] == pytest.approx(expected, abs=1e-12)
+            expected = turn_from(before.matrix(), after.matrix())[0] + turn_rad * up
+            assert turn_from(before.matrix(), wound.matrix())[0] == pytest.approx(expected, abs=1e-12)
     off = gtsam.Rot3.Logmap(before.between(wound)) - gtsam.Rot3.Logmap(before.between(after)) - turn_rad * up
     assert np.abs(off).max() > 0.01
 
@@ -112,9 +115,20 @@ def test_a_submap_that_moves_as_a_whole_stays_exact():
         assert (factor.error(moved) == pytest.approx(factor.error(values), abs=1e-6)) == is_relative
 
 
-def test_the_frame_of_a_turned_pose_turns_with_it():
-    pose, motion = gtsam.Pose3.Expmap(np.array([0.3, -0.5, 2.0, 1, 2, 3])), gtsam.Pose3(gtsam.Rot3.Rz(2.5), [1, 2, 0])
-    assert level_frame(motion.compose(pose)).equals(motion.compose(level_frame(pose)), 1e-9)
+@pytest.mark.parametrize("roll_rad", [0.0, 1.5, 3.0, np.pi])
+def test_yaw_turns_with_a_rotation_whatever_its_attitude(roll_rad):
+    """Upside down as well, where that of the rotation alone is not defined."""
+    start = gtsam.Rot3.RzRyRx(roll_rad, 0.1, 2.0)
+    for tilt in (gtsam.Rot3(), gtsam.Rot3.RzRyRx(0.2, -0.3, 0.0)):
+        R = tilt.compose(start)
+        turned, derivative = yaw_from(start.matrix(), gtsam.Rot3.Rz(2.5).compose(R).matrix())
+        assert turned - yaw_from(start.matrix(), R.matrix())[0] == pytest.approx(2.5, abs=1e-12)
+        check_derivative(
+            lambda theta: np.array([yaw_from(start.matrix(), R.retract(theta).matrix())[0]]),  # noqa: B023
+            yaw_from(start.matrix(), R.matrix())[1][None],
+            np.zeros(3),
+        )
+        assert np.linalg.norm(derivative) < 1.5
 
 
 @pytest.mark.parametrize("most", [1, 3])

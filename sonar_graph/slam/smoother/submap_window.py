@@ -26,7 +26,8 @@ STALE = 0.02
 SETTLED = 0.002
 """Decrease of the error (half a sum of squares) a keyframe, by a step of those of a submap, up to which they rest."""
 AT_ONCE = 100.0
-"""Shift, in thresholds of relinearisation, from which on the next update relinearises."""
+"""Shift of a keyframe, in thresholds of relinearisation, from which on the next update relinearises. Not of landmarks:
+the height of one that is only seen from one level never comes to rest."""
 MOST = 50
 """Submaps from which on neighbours are joined."""
 MOST_ROWS = 120
@@ -203,7 +204,8 @@ class SubmapWindow:
                 new.add(factor)
         self._updates += 1
         is_due = self._updates % self.relinearised_every == 0 or not self._submaps
-        is_due = is_due or bool(np.abs(self._isam.getDelta().vector()).max(initial=0.0) > AT_ONCE * self._threshold)
+        shifts = self._isam.getDelta()
+        is_due = is_due or any(np.abs(shifts.at(key)).max() > AT_ONCE * self._threshold for key in self._times_s)
         estimate = self.estimate()
         if self._whole and not touched and (not is_due or self.relinearised_every == 1):
             self._turn = (self._turn + 1) % len(self._whole)
