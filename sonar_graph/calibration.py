@@ -34,6 +34,8 @@ Positive = Annotated[Number, Field(gt=0)]
 Angle = Annotated[Number, within(-2 * np.pi, 2 * np.pi, "radians between -2π and 2π (45° are 0.785)")]
 Angles = tuple[Angle, Angle, Angle]
 Latitude = Annotated[Number, within(-np.pi / 2, np.pi / 2, "radians between -π/2 and π/2 (48° are 0.838)")]
+Rate = Annotated[Number, within(-1, 1, "rad/s between -1 and 1 (1°/s are 0.0175)")]
+Spread = Annotated[Number, within(0, 2 * np.pi, "radians between 0 and 2π (3° are 0.052)")]
 Gravity = Annotated[Number, within(9, 10.5, "m/s² between 9 and 10.5 (9.76 to 9.84 on Earth)")]
 Vector = tuple[Number, Number, Number]
 Sigmas = tuple[NotNegative, NotNegative, NotNegative]
@@ -65,7 +67,7 @@ class ImuCalibration(Section):
     """White noise of angular rate, rad/s/√Hz."""
     gyro_bias_sigma: NotNegative = 5e-5
     """Bias left when the run starts, rad/s; 0: no bias is estimated."""
-    gyro_bias_rad_s: Vector = (0.0, 0.0, 0.0)
+    gyro_bias_rad_s: tuple[Rate, Rate, Rate] = (0.0, 0.0, 0.0)
     """Bias that is known, in the IMU's axes: every estimator takes it from the rows."""
     gyro_bias_walk_density: NotNegative = 1e-6
     """Random walk of the bias, rad/s²/√Hz."""
@@ -94,7 +96,7 @@ class DvlCalibration(Section):
     """Random walk of the vehicle's velocity, m/s/√s: for DVL gaps without accelerometers and the gate of outliers."""
     scale_error: Annotated[Number, within(-0.2, 0.2, "a relative error between -0.2 and 0.2 (0.5 % are 0.005)")] = 0.0
     """Known relative error of its velocities, 0.01 where they are 1 % too fast: taken from the rows."""
-    scale_sigma: NotNegative = 0.0
+    scale_sigma: Annotated[Number, within(0, 0.2, "a relative error between 0 and 0.2 (0.5 % are 0.005)")] = 0.0
     """Standard deviation of the relative error that is left; 0: none is estimated."""
 
 
@@ -110,9 +112,9 @@ class DepthCalibration(Section):
 class HeadingCalibration(Section):
     """Compass, attitude reference or gyrocompass."""
 
-    sigma_rad: Positive = 0.02
+    sigma_rad: Annotated[Spread, Field(gt=0)] = 0.02
     """White noise of one sample, where the log has no variance."""
-    bias_sigma_rad: NotNegative = 0.05
+    bias_sigma_rad: Spread = 0.05
     """Error that all samples of a run share: deviation, declination, mounting; 0: none is estimated."""
 
 

@@ -80,6 +80,10 @@ def test_wrong_field_is_refused_by_source_and_name(values, field):
         ({"earth_rate_latitude_rad": 48.0}, "earth_rate_latitude_rad: expected radians between -π/2 and π/2"),
         ({"dvl": {"mounting": {"rpy_rad": [0, 0, 45]}}}, "dvl.mounting.rpy_rad.2: expected radians between -2π and 2π"),
         ({"start": {"rpy_rad": [0, 0, -90]}}, "start.rpy_rad.2: expected radians between -2π and 2π"),
+        ({"imu": {"gyro_bias_rad_s": [0, 1000, 0]}}, "imu.gyro_bias_rad_s.1: expected rad/s between -1 and 1"),
+        ({"dvl": {"scale_sigma": 5}}, "dvl.scale_sigma: expected a relative error between 0 and 0.2"),
+        ({"heading": {"bias_sigma_rad": 90}}, "heading.bias_sigma_rad: expected radians between 0 and 2π"),
+        ({"heading": {"sigma_rad": 90}}, "heading.sigma_rad: expected radians between 0 and 2π"),
         ({"gravity_m_s2": 9810}, "gravity_m_s2: expected m/s² between 9 and 10.5"),
     ],
 )
@@ -91,6 +95,9 @@ def test_a_number_that_nothing_can_have_is_refused(values, message):
 
 def test_numbers_at_the_edge_of_what_can_be_are_taken():
     exact = {"start": {"rpy_sigma_rad": [0, 0, 0], "rpy_rad": [0, 0, -2 * np.pi]}, "imu": {"gyro_noise_density": 0}}
+    aided = {"heading": {"bias_sigma_rad": 0, "sigma_rad": 2 * np.pi}, "dvl": {"scale_sigma": 0.2}}
+    biased = parse(Calibration, {"imu": {"gyro_bias_rad_s": [1, 0, -1]}} | aided, "x")
+    assert biased.imu.gyro_bias_rad_s == (1, 0, -1)
     at_pole = {"earth_rate_latitude_rad": -np.pi / 2, "gravity_m_s2": 9.832}
     assert parse(Calibration, exact | at_pole, "x").gravity_m_s2 == 9.832
 
