@@ -283,7 +283,11 @@ class FilterShell(ABC):
         if stamp_ns < node_ns - KEPT_NS:
             return False
         first_ns, last_ns = min(stamp_ns, node_ns), max(stamp_ns, node_ns)
-        between = self.odometry.motion(first_ns, last_ns, self.gyro_bias(), self.attitude(), since_ns)
+        bias, attitude = self.gyro_bias(), self.attitude()
+        between = self.odometry.motion(first_ns, last_ns, bias, attitude, since_ns)
+        if stamp_ns < node_ns:  # the attitude is that of its end
+            attitude = attitude @ between.i_T_j.rotation().matrix().T
+            between = self.odometry.motion(first_ns, last_ns, bias, attitude, since_ns)
         T, C, D = between.i_T_j, between.covariance, between.D_bias
         if stamp_ns < node_ns:
             A = T.AdjointMap()

@@ -464,15 +464,19 @@ def test_aiding_in_a_gap_shares_the_error_of_the_motion(kind):
 
 
 def test_a_late_fix_has_the_motion_backwards_with_its_covariance_and_derivative(monkeypatch):
-    """By differences of the inverse."""
+    """By differences of the inverse; it is asked for with the attitude at its start, that of the fix."""
     told, (gyro, doppler), nothing = [], circle(), np.zeros(6)
     monkeypatch.setattr(EkfSlam, "_fix", lambda _, motion, *__: told.append(motion))
     slam, end_ns, fix_ns = begun(EkfSlam, circle_calibration()), later(10.0), later(6.03)
     slam.process(Measurements(end_ns, gyro.between(T0_NS - 1, end_ns), doppler.between(T0_NS - 1, end_ns)))
     late = PositionFixes(np.array([fix_ns]), np.zeros((1, 3)), np.eye(3)[None])
+    asked, motion = [], slam.odometry.motion
+    monkeypatch.setattr(slam.odometry, "motion", lambda *of: asked.append(of[3]) or motion(*of))
     slam.process(Measurements(end_ns, positions=late))
+    monkeypatch.undo()
     forth, (back,) = slam.odometry.motion(fix_ns, slam.node_ns, np.zeros(3)), told
     inverse = forth.i_T_j.inverse()
+    assert_allclose(asked[-1] @ forth.i_T_j.rotation().matrix(), slam.attitude(), atol=1e-9)
     assert_allclose(back.dR, inverse.rotation().matrix(), atol=1e-12)
     assert_allclose(back.dp, inverse.translation(), atol=1e-12)
     moved = lambda eps: inverse.localCoordinates(forth.i_T_j.retract(eps).inverse())  # noqa: E731
