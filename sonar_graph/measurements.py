@@ -30,9 +30,14 @@ FARTHEST_M = 100_000.0
 """Largest range accepted; no sonar sees farther."""
 UNMEASURED_M2 = 1e8
 """Variance of a coordinate that a position fix does not measure, such as a height: 10 km squared."""
+FARTHEST_FIX_M = 1e7
+"""Largest coordinate of a position fix, and sigma of one: a quarter of the Earth's circumference."""
+MOST_YAW_RAD = 1e9
+"""Largest yaw of a compass that counts on over turns: a double has steps of 1e-7 rad there, finer than any compass."""
 
 FULL_TURN_RAD = 2.0 * np.pi
-"""No azimuth lies beyond: half a turn to either side, or a turn where it is counted from 0 on."""
+"""No azimuth lies beyond: half a turn to either side, or a turn where it is counted from 0 on. A sigma of yaw beyond it
+tells nothing (a direction anywhere on the circle has 1.8 rad)."""
 
 
 def no_posterior(probability: Floats) -> NDArray[np.bool_]:
@@ -198,8 +203,9 @@ class Heading(Block):
     """Standard deviation of white noise, shape (n,); NaN where unknown: the calibration's value then holds."""
 
     def are_sound(self) -> NDArray[np.bool_]:
-        """Mask, shape (n,), of rows whose sigma is positive and finite, or unknown."""
-        return np.asarray(np.isnan(self.sigma_rad) | ((self.sigma_rad > 0) & np.isfinite(self.sigma_rad)))
+        """Mask, shape (n,), of rows whose yaw is at most `MOST_YAW_RAD`, and sigma above 0 up to a turn, or unknown."""
+        is_sigma = np.isnan(self.sigma_rad) | ((self.sigma_rad > 0) & (self.sigma_rad <= FULL_TURN_RAD))
+        return np.asarray(is_sigma & (np.abs(self.yaw_rad) <= MOST_YAW_RAD))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -220,13 +226,18 @@ class PositionFixes(Block):
     """Along the world's axes, shape (n, 3, 3); NaN where unknown: the calibration's value then holds."""
 
     def are_sound(self) -> NDArray[np.bool_]:
-        """Mask, shape (n,), of rows with a positive definite covariance (Sylvester's criterion) or none (NaN)."""
+        """Mask, shape (n,), of rows with a positive definite covariance (Sylvester's criterion) or none (NaN).
+
+        No coordinate and no sigma is beyond `FARTHEST_FIX_M`.
+        """
         with np.errstate(all="ignore"):
             sigmas = np.sqrt(np.einsum("nii->ni", self.covariance_m2))
             correlations = self.covariance_m2 / (sigmas[:, :, None] * sigmas[:, None, :])
             is_symmetric = np.abs(correlations - np.swapaxes(correlations, 1, 2)).max(axis=(1, 2)) <= ROUNDING
             is_definite = (correlations[:, 0, 1] ** 2 < 1 - ROUNDING) & (np.linalg.det(correlations) > ROUNDING)
-        return np.asarray((is_symmetric & is_definite) | np.isnan(self.covariance_m2).any(axis=(1, 2)))
+            is_covariance = is_symmetric & is_definite & (sigmas <= FARTHEST_FIX_M).all(axis=1)
+        is_near = (np.abs(self.position_m) <= FARTHEST_FIX_M).all(axis=1)
+        return np.asarray(is_near & (is_covariance | np.isnan(self.covariance_m2).any(axis=(1, 2))))
 
 
 @dataclass(frozen=True, eq=False, repr=False)

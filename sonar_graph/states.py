@@ -244,7 +244,7 @@ class Refusal(StrEnum):
     LATE = "refused: the motion that it belongs to was already used"
     UNCONFIRMED = "refused: no other velocity confirms it, and none before it is near enough"
     WAITED = "not used: it came after a gap, and only the velocity that confirmed it was"
-    UNSOUND = "refused: its covariance is not positive definite"
+    UNSOUND = "refused: its covariance is not positive definite, or no sensor gives its value or its noise"
     INCOMPLETE = "refused: too few beams, and nothing to complete them with"
     BEYOND_SENSOR = "refused: no gyro or accelerometer measures this"
     OUT_OF_REACH = "refused: no vehicle reaches this depth from the last, or no other depth confirms it"

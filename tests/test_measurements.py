@@ -11,6 +11,7 @@ from hypothesis.extra import numpy as arrays
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import (
     FIRST_TOO_LARGE_ID,
+    UNMEASURED_M2,
     Depth,
     Dvl,
     Heading,
@@ -273,3 +274,23 @@ def test_heading_and_fixes_tell_the_rows_whose_noise_cannot_be():
     covs = np.stack([*sound, skew, indefinite, cyclic, infinite, -good, 0 * good])
     fixes = PositionFixes(np.arange(10), np.zeros((10, 3)), covs)
     assert fixes.are_sound().tolist() == [True] * 4 + [False] * 6
+
+
+def test_a_heading_counts_turns_while_a_double_keeps_them_and_its_sigma_is_at_most_one():
+    for yaw, sigma, is_sound in (
+        (-1e9, 2 * np.pi, True), (1e9, np.nan, True), (-1.001e9, 0.1, False), (1e300, np.nan, False),
+        (0.0, 6.3, False), (0.0, 1e200, False),
+    ):  # fmt: skip
+        assert Heading([0, 1], [yaw, 0.0], [sigma, 0.1]).are_sound().tolist() == [is_sound, True]
+    assert np.spacing(1e9) < 1.2e-7
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_a_fix_and_its_sigma_are_within_a_quarter_of_the_earth_s_circumference(axis):
+    for at, variance, is_sound in (
+        (-1e7, 1e14, True), (1e7, np.nan, True), (0.0, UNMEASURED_M2, True),
+        (-1.001e7, 4.0, False), (1e12, np.nan, False), (1e308, 4.0, False), (0.0, 1.001e14, False), (0.0, 1e300, False),
+    ):  # fmt: skip
+        positions, covs = np.zeros((2, 3)), np.stack([np.eye(3)] * 2)
+        positions[0, axis], covs[0, axis, axis] = at, variance
+        assert PositionFixes([0, 1], positions, covs).are_sound().tolist() == [is_sound, True]

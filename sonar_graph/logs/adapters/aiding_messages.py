@@ -20,7 +20,7 @@ from sonar_graph.logs.adapters.adapter import Adapter, CovarianceFields, Scale, 
 from sonar_graph.logs.adapters.message_table import NOT_FINITE, Dropped, MessageTable, fit_rows, not_finite
 from sonar_graph.logs.geodesy import Origin, east_north_up
 from sonar_graph.logs.mcap import Keep, Topic
-from sonar_graph.measurements import UNMEASURED_M2, Floats, Heading, PositionFixes
+from sonar_graph.measurements import FARTHEST_FIX_M, FULL_TURN_RAD, UNMEASURED_M2, Floats, Heading, PositionFixes
 
 ENU_R_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 STEEPEST_RAD = np.radians(80.0)
@@ -103,7 +103,14 @@ class HeadingAdapter(Adapter):
         return Heading(table.stamps_ns[rows], yaw_rad, np.sqrt(variance[rows])), dropped
 
     def warnings(self, table: MessageTable) -> Iterator[str]:
-        """Warning about an angle that looks like degrees."""
+        """Warnings about a sigma beyond a full turn, and an angle that looks like degrees."""
+        if self.variance is not None:
+            is_beyond = self.is_measured(table) & (self.variance.read_variance(table) > FULL_TURN_RAD**2)
+            if is_beyond.any():
+                yield (
+                    f"{np.count_nonzero(is_beyond)} of {len(table)} rows have a sigma beyond a full turn "
+                    f"({self.variance.fields[0]}): estimators do not use them"
+                )
         if self.yaw is not None:
             angles = np.abs(table.column(self.yaw) * self.scale)
             largest = float(np.max(angles, initial=0.0, where=np.isfinite(angles)))
@@ -226,6 +233,13 @@ class PositionAdapter(Adapter):
         return fixes, dropped
 
     def warnings(self, table: MessageTable) -> Iterator[str]:
-        """Warning about matrices that are no covariances."""
+        """Warnings about matrices that are no covariances, and places that are not on the Earth."""
         if self.covariance is not None:
             yield from self.covariance.warnings(table)
+        if self.position is not None:
+            is_far = (np.abs(table.beside(self.position).astype(float)) > FARTHEST_FIX_M).any(axis=1)
+            if is_far.any():
+                yield (
+                    f"{np.count_nonzero(is_far)} of {len(table)} rows have a position beyond "
+                    f"{FARTHEST_FIX_M / 1e3:.0f} km: estimators do not use them"
+                )

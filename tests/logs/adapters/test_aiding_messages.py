@@ -91,6 +91,12 @@ CASES: dict[str, Case] = {
     "bearing taken for rad": (
         [("/compass", "std_msgs/msg/Float64", [{"data": bearing} for bearing in (0.0, 350.0)])],
         f"[heading]\n{COMPASS}", {}, {"log.warnings": "heading: data is up to 350, more than a whole circle in rad"}),
+    "sigma of more than a turn": (
+        [oriented(YAW, variance=40.0), dvl()], "", {"heading.sigma_rad": [40.0**0.5] * 2},
+        {"log.warnings": "heading: 2 of 2 rows have a sigma beyond a full turn"}),
+    "fixes off the Earth": (
+        [points((1, 2, 3), (1.1e7, 0, 0))], "", {"positions.position_m": [[1, 2, 3], [1.1e7, 0, 0]]},
+        {"log.warnings": "positions: 1 of 2 rows have a position beyond 10000 km: estimators do not use them"}),
     "acoustic fixes": (
         [rows_of("/usbl/pose", POSE, [{"pose": {"pose": {"position": vector(1, 2, -3)}, "covariance": [0.0] * 36}}])],
         "", {"positions.position_m": [[1, 2, -3]]}, {}),
