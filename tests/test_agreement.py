@@ -220,6 +220,52 @@ def test_rows_from_before_the_first_epoch_are_not_called_late(kind):
     sequence, _ = rail(NODES)
     early_ns = np.array([T0_NS - 2 * NS_PER_S, T0_NS - NS_PER_S])
     depth, heading = Depth(early_ns, np.zeros(2), np.full(2, 1e-4)), Heading(early_ns, np.zeros(2), np.full(2, 0.01))
-    estimator = made(kind, sequence.calibration)
-    run(estimator, replace(sequence, depth=depth, heading=heading))
+    fixes = PositionFixes(early_ns, np.full((2, 3), 9.0), np.tile(1e-6 * np.eye(3), (2, 1, 1)))
+    estimator, others = made(kind, sequence.calibration), made(kind, sequence.calibration)
+    estimates = run(estimator, replace(sequence, depth=depth, heading=heading, positions=fixes))
+    estimator.process(Measurements(sequence.end_ns, heading=heading, positions=fixes))
     assert not estimator.refused_rows()
+    assert max(difference(estimates, run(others, sequence))) == 0.0
+    estimates = [e.process(Measurements(sequence.end_ns + 1)) for e in (estimator, others)]
+    assert max(difference(estimates[:1], estimates[1:])) == 0.0
+
+
+@pytest.mark.parametrize("kind", [EkfSlam, InvariantEkf, Isam2])
+def test_headings_of_one_stamp_in_two_calls_both_count(kind):
+    sequence, _ = rail(NODES)
+    start = sequence.calibration.start.model_copy(update={"rpy_sigma_rad": (1e-6, 1e-6, 0.3)})
+    known = sequence.calibration.model_copy(update={"start": start})
+    sigmas = []
+    for count in range(3):
+        estimator = made(kind, known)
+        middle_ns = int(sequence.dvl.stamps_ns[NODES // 2])
+        for step in replace(sequence, calibration=known, detections=None).replay(sequence.instants(1 / STEP_S)):
+            estimate = estimator.process(step)
+            for _ in range(count * (step.end_ns == middle_ns + NS_PER_S)):
+                row = Heading(np.array([step.end_ns]), np.zeros(1), np.full(1, 0.3))
+                estimate = estimator.process(Measurements(step.end_ns, heading=row))
+        assert not estimator.refused_rows()
+        sigmas.append(estimate.covariance[2, 2])
+    one, two = 0.05**2 + 0.3**2, 0.05**2 + 0.3**2 / 2
+    assert sigmas == pytest.approx([0.09, 1 / (1 / 0.09 + 1 / one), 1 / (1 / 0.09 + 1 / two)], rel=1e-2)
+
+
+NO_ROWS = {
+    "sigma of more than a turn": Heading(np.array([0]), np.zeros(1), np.full(1, 1e200)),
+    "more turns than a double keeps": Heading(np.array([0]), np.full(1, 1e300), np.full(1, 0.01)),
+    "beyond the Earth": PositionFixes(np.array([0]), np.full((1, 3), 1e12), np.eye(3)[None]),
+    "beyond everything": PositionFixes(np.array([0]), np.full((1, 3), 1e200), np.full((1, 3, 3), np.nan)),
+    "sigma beyond the Earth": PositionFixes(np.array([0]), np.zeros((1, 3)), 1e300 * np.eye(3)[None]),
+}
+
+
+@pytest.mark.parametrize("kind", [EkfSlam, InvariantEkf, Isam2])
+@pytest.mark.parametrize("row", NO_ROWS.values(), ids=NO_ROWS)
+def test_a_heading_or_fix_that_no_sensor_gives_is_named_and_changes_nothing(kind, row):
+    sequence, _ = rail(NODES)
+    at_ns = T0_NS + 5 * NS_PER_S
+    sensor = "heading" if isinstance(row, Heading) else "positions"
+    estimator, others = made(kind, sequence.calibration), made(kind, sequence.calibration)
+    estimates = run(estimator, replace(sequence, **{sensor: replace(row, stamps_ns=np.array([at_ns]))}))
+    assert [refused[:3] for refused in estimator.refused_rows()] == [(sensor, at_ns, Refusal.UNSOUND)]
+    assert max(difference(estimates, run(others, sequence))) < 1e-9

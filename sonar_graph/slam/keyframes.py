@@ -24,7 +24,7 @@ from sonar_graph.motion import MotionSource, PreintegratedMotion
 from sonar_graph.navigation.alignment import gravity_direction
 from sonar_graph.numerics import cross_matrix
 from sonar_graph.slam.biases import BIASES, COMPASS, HEADING, TILT, bias_sigmas, by_biases, gyro_bias_of
-from sonar_graph.slam.models import HUBER_WIDTH, OdometryWithBias, factors
+from sonar_graph.slam.models import HUBER_WIDTHS, OdometryWithBias, factors
 from sonar_graph.slam.smoother import Changed, Smoother
 from sonar_graph.states import Refusal, RefusedRow
 
@@ -86,7 +86,7 @@ class Keyframes:
         self._linearised: tuple[Floats, Floats] = np.zeros(BIASES), np.eye(3)
         self._waiting: dict[str, list[Any]] = {"depth": [], "heading": []}
         self._lag_ns = min(round(min(self.smoother.params.lag_s, 1e9) / S_PER_NS), LONGEST_LATE_NS)
-        self._newest_heading_ns = EARLIEST_NS
+        self._newest_heading_ns, self._reached_ns = EARLIEST_NS, LATEST_NS
         self._told = 0
         self._refused: list[RefusedRow] = []
 
@@ -126,9 +126,10 @@ class Keyframes:
                 self._waiting["depth"].append(depth)
         if heading is None:
             return
-        is_sound, is_new = heading.are_sound(), heading.stamps_ns > max(self._newest_heading_ns, set_ns)
+        is_sound = heading.are_sound()
+        is_new = (heading.stamps_ns > set_ns) & (heading.stamps_ns >= self._newest_heading_ns)
         for stamp_ns, sound, new in zip(heading.stamps_ns.tolist(), is_sound.tolist(), is_new.tolist(), strict=True):
-            if not sound or not (new or stamp_ns == self._newest_heading_ns):  # which was sent again
+            if not sound or not new:
                 self.refuse("heading", stamp_ns, Refusal.LATE if sound else Refusal.UNSOUND)
         if (is_sound & is_new).any():
             self._waiting["heading"].append(rows := heading.rows(np.flatnonzero(is_sound & is_new)))
@@ -140,8 +141,9 @@ class Keyframes:
 
     @property
     def refused(self) -> list[RefusedRow]:
-        """Rows of all sensors but the sonar that are not used, and why."""
-        return self.odometry.refused + self._refused
+        """Rows of all sensors but the sonar that are not used, and why; none is late that is from before the start."""
+        own = [row for row in self._refused if row.reason is not Refusal.LATE or row.stamp_ns >= self._reached_ns]
+        return self.odometry.refused + own
 
     def advance(self, until_ns: int) -> list[Changed]:
         """Set the keyframes that are due from epochs reached at an instant; the first starts the graph.
@@ -155,7 +157,7 @@ class Keyframes:
             if start_ns is None:
                 return []
             self.stamps_ns.append(start_ns)
-            self._bias_since_ns = start_ns
+            self._bias_since_ns, self._reached_ns = start_ns, self.odometry.reached_ns(start_ns)
             self.smoother.add_pose(X(0), self.calibration.start.pose(), start_ns * S_PER_NS)
             self.smoother.add({"start prior": factors.start_prior(X(0), self.calibration)})
             self.bias_keys.append(B(0))
@@ -335,7 +337,7 @@ class Keyframes:
         missed = wrapped(heading.yaw_rad[carried.first :] - yaw_rad[:-1] - compass_rad)
         sigma = heading.sigma_rad[carried.first :]
         sigma = np.where(np.isnan(sigma), self.calibration.heading.sigma_rad, sigma)
-        off = np.abs(wrapped(missed - np.median(missed))) / (HUBER_WIDTH * sigma)
+        off = np.abs(wrapped(missed - np.median(missed))) / (HUBER_WIDTHS[1] * sigma)
         weights, mean_variance = weights_at_end(sigma**2 * np.maximum(1.0, off), wander)
         measured = float(yaw_rad[-1] + compass_rad + weights @ missed)
         key = self.bias_keys[-1]

@@ -146,15 +146,24 @@ def test_updates_by_detection_depth_heading_and_fix_are_the_textbook_s(filter_, 
 
 @both
 def test_an_outlying_fix_has_the_kernel_s_noise(filter_):
-    """Ten standard deviations S off, ``R`` is ``10 / 1.345 R``; 1.3 off it is R."""
+    """Ten standard deviations S off, ``R`` is ``10 / 1.628 R``; 1.6 off it is R; k of a heading is 1.345."""
     world, R_z = world_at(ANGLES), np.diag([0.04, 0.09, 0.25])
     _, P = filter_.estimate(begun(filter_, world))
     H, _ = numerical(lambda true, eps: pose_after(true, STILL, eps).translation(), filter_, world)
-    for deviations, times in ((1.3, 1.0), (10.0, 10.0 / 1.345)):
+    for deviations, times in ((1.6, 1.0), (10.0, 10.0 / 1.628)):
         slam, e = begun(filter_, world), np.zeros(3)
         e[0] = deviations / np.sqrt(np.linalg.inv(H @ P @ H.T + R_z)[0, 0])
         slam.correct_position(STILL, np.zeros(3), world.X + e, R_z)
         assert_corrected(filter_, slam, world, P, H, times * R_z, e)
+    H, _ = numerical(
+        lambda true, eps: np.array([pose_after(true, STILL, eps).rotation().yaw() + true.bias[9]]), filter_, world, [0]
+    )
+    S = (H @ P @ H.T).item() + 1e-4
+    for deviations, times in ((1.3, 1.0), (5.0, 5.0 / 1.345)):
+        slam, e = begun(filter_, world), np.array([deviations * np.sqrt(S)])
+        yaw = pose_after(world, STILL).rotation().yaw() + world.bias[9]
+        slam.correct_heading(STILL, yaw + e[0], 1e-4)
+        assert_corrected(filter_, slam, world, P, H, times * np.array([[1e-4]]), e)
 
 
 @both

@@ -9,13 +9,15 @@ import pytest
 from gtsam.symbol_shorthand import B, C, L, M, V, X
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi
 
 from sonar_graph.calibration import Calibration, PlanarMotion, Start
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation.joint_preintegration import JointMotion, JointPreintegrator
-from sonar_graph.slam.models import OdometryStack, OdometryWithBias, factors
+from sonar_graph.slam.models import HUBER_WIDTHS, OdometryStack, OdometryWithBias, factors
 from sonar_graph.slam.models.inertial_factors import doppler_odometry, inertial_doppler_odometry
 from sonar_graph.slam.models.views import range_azimuth
 from sonar_graph.testing import check_consistent, check_jacobians
@@ -231,6 +233,27 @@ def test_the_robust_kernel_weighs_every_part_of_a_sighting(correlation):
         for kernel in (huber, plain)
     )
     assert robust < 0.2 * quadratic
+
+
+def efficiency(k: float, d: int) -> float:
+    """Of Huber's mean of d-dimensional Gaussian noise of length r: ``(E psi')^2 / E psi^2``, by Stein's lemma."""
+    mean = lambda f: sum(quad(lambda r: f(r) * chi(d).pdf(r), *ends)[0] for ends in ((0, k), (k, 20)))  # noqa: E731
+    slope, square = mean(lambda r: min(r, k) * r) / d, mean(lambda r: min(r, k) ** 2) / d
+    return slope**2 / square
+
+
+@pytest.mark.parametrize("d", [1, 3])
+def test_the_kernel_of_headings_and_fixes_is_95_percent_efficient_in_its_dimensions(d):
+    """A width of the other one is not; far off the loss is ``k (r - k / 2)``."""
+    k, (other,) = HUBER_WIDTHS[d], [width for dimension, width in HUBER_WIDTHS.items() if dimension != d]
+    assert efficiency(k, d) == pytest.approx(0.95, abs=1e-4)
+    assert abs(efficiency(other, d) - 0.95) > 0.01
+    if d == 1:
+        factor = factors.heading(X(0), B(0), 1.0, 0.1)
+    else:
+        factor = factors.position(X(0), np.array([6.0, 0.0, 8.0]), np.zeros(3), np.eye(3))
+    values = values_of(X0=gtsam.Pose3(), B0=np.zeros(11))
+    assert factor.error(values) == pytest.approx(k * (10.0 - k / 2))
 
 
 @poses

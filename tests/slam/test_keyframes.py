@@ -20,9 +20,10 @@ from sonar_graph.calibration import (
     SonarCalibration,
     Start,
 )
-from sonar_graph.measurements import Depth, Dvl, Imu
+from sonar_graph.measurements import Depth, Dvl, Heading, Imu
 from sonar_graph.navigation import Odometry, PreintegratedMotion
 from sonar_graph.navigation.alignment.gravity import earth_rate_in_world
+from sonar_graph.numerics import cross_matrix
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 from sonar_graph.slam import Isam2
 from sonar_graph.slam.keyframes import KeyframeParams, Keyframes, weights_at_end
@@ -385,6 +386,41 @@ def test_frames_between_gaps_tell_all(at_s: list[float], told: list[float]):
     keyframes = keyframes_over_gaps()
     assert shares(keyframes, at_s) == pytest.approx(told)
     assert len(keyframes.stamps_ns) == 1
+
+
+@pytest.mark.parametrize("off", [1.3, 10.0])
+def test_a_heading_far_from_the_others_has_its_variance_larger_by_what_exceeds_the_kernel_s_width(off):
+    """Four that agree and one beside them, with exact gyros: the mean's information is a sum by hand, k = 1.345."""
+    exact = NO_BIAS.model_copy(update={"gyro_noise_density": 1e-9})
+    keyframes, sigma = keyframes_of(Calibration(imu=exact, dvl=EXACT_DVL)), 0.02
+    yaw_rad = np.array([0.0, 0.0, off * sigma, 0.0, 0.0])
+    keyframes.add(
+        level_imu(3.0), steady_dvl(3.0), None, Heading(at(0.3, 0.6, 0.9, 1.2, 1.5), yaw_rad, np.full(5, sigma))
+    )
+    keyframes.advance(int(at(2.5)[0]))
+    (factor,) = [f for f in factors_on(keyframes, gtsam.CustomFactor, X(1)) if f.dim() == 1]
+    doubt = max(1.0, off / 1.345)
+    assert factor.noiseModel().noise().covariance().item() == pytest.approx(sigma**2 / (4 + 1 / doubt), rel=1e-6)
+
+
+def test_fixes_have_the_covariance_of_the_motion_from_their_keyframe_and_share_its_error_over_a_gap():
+    """With bottom lock, then the first and second in a gap: a sum by hand, of the lever arm too."""
+    keyframes, antenna = keyframes_over_gaps(), np.array([0.3, -0.2, 0.5])
+    positions = keyframes.calibration.positions.model_copy(update={"antenna_m": tuple(antenna)})
+    keyframes.calibration = keyframes.calibration.model_copy(update={"positions": positions})
+    expected = []
+    for when, times in ((1.0, 1.0), (3.0, 2.0), (4.0, 6.0)):
+        (stamp_ns,) = at(when).tolist()
+        keyframes.advance(stamp_ns)
+        C = times * keyframes.motion_since_newest(stamp_ns).covariance
+        lever = np.hstack((-cross_matrix(antenna), np.eye(3)))
+        expected.append(1e-4 * np.eye(3) + lever @ C @ lever.T)
+        keyframes.add_fix(stamp_ns, np.zeros(3), 1e-4 * np.eye(3))
+        keyframes.update_if_due()
+    assert len(keyframes.stamps_ns) == 1
+    found = [factor.noiseModel().noise().covariance() for factor in factors_on(keyframes, gtsam.GPSFactorArm, X(0))]
+    assert found == [pytest.approx(covariance, rel=1e-6, abs=1e-8) for covariance in expected]
+    assert np.abs(expected[0] - 1e-4 * np.eye(3)).max() > 1e-5
 
 
 @pytest.mark.parametrize(("depth_s", "count"), [(1.5, 0), (5.6, 0), (6.0, 1)])

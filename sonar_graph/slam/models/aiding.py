@@ -13,9 +13,9 @@ import numpy as np
 
 from sonar_graph.measurements import Floats
 
-HUBER_WIDTH = 1.345
-"""k: 95 % efficient for Gaussian noise. It is convex: a start that is far off finds its way, which a kernel that lets
-go of large errors does not promise."""
+HUBER_WIDTHS = {1: 1.345, 3: 1.628}
+"""k of a heading and of a fix: 95 % efficient for Gaussian noise of so many dimensions. The kernel is convex: a start
+that is far off finds its way, which a kernel that lets go of large errors does not promise."""
 
 
 def yaw_and_derivative(R: Floats) -> tuple[float, Floats]:
@@ -28,4 +28,4 @@ def yaw_and_derivative(R: Floats) -> tuple[float, Floats]:
 def doubted(e: Floats, S: Floats, R: Floats) -> Floats:
     """Covariance of an innovation e with the kernel's noise, where it is S with Gaussian noise R, shapes (m, m)."""
     distance = math.sqrt(e @ np.linalg.solve(S, e))
-    return np.asarray(S + (max(1.0, distance / HUBER_WIDTH) - 1.0) * R)
+    return np.asarray(S + (max(1.0, distance / HUBER_WIDTHS[len(e)]) - 1.0) * R)

@@ -27,7 +27,7 @@ from sonar_graph.measurements import Floats
 from sonar_graph.navigation import PreintegratedMotion
 from sonar_graph.numerics import cross_matrix
 from sonar_graph.slam.biases import ACCEL, COMPASS
-from sonar_graph.slam.models.aiding import HUBER_WIDTH, yaw_and_derivative
+from sonar_graph.slam.models.aiding import HUBER_WIDTHS, yaw_and_derivative
 from sonar_graph.slam.models.kernels import Robust
 from sonar_graph.slam.models.sonar_model import wrap_angle
 from sonar_graph.slam.models.views import range_azimuth_jacobians
@@ -234,7 +234,7 @@ def gravity_with_bias(
 
 def huber(noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
     """Noise of headings and position fixes, of which some are outliers."""
-    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(HUBER_WIDTH), noise)
+    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(HUBER_WIDTHS[noise.dim()]), noise)
 
 
 def heading(
