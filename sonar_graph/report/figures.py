@@ -66,16 +66,19 @@ def error_figure(comparison: Comparison) -> Figure | None:
 
 def own_map_figure(comparison: Comparison) -> Figure | None:
     """Causal position error of each run on the map that it had at that instant."""
-    found = [own_map_errors(run, comparison.sequence, comparison.instants_ns) for run in comparison.runs]
-    if not any(len(stamps_ns) for stamps_ns, _ in found):
+    found = {}
+    for index, run in enumerate(comparison.runs):
+        scored = comparison.errors.get(run.estimator, {}).get("causal")
+        if scored is not None and len((series := own_map_errors(run, comparison.sequence, scored.stamps_ns))[0]):
+            found[index] = series
+    if not found:
         return None
     figure, axes = style.blank_panels(1, 1, SINGLE_IN)
     panel: Axes = axes[0, 0]
-    for index, (stamps_ns, errors_m) in enumerate(found):
-        if len(stamps_ns):
-            seconds = style.seconds_since_start(comparison, stamps_ns)
-            look = {"color": style.colour(index), "linestyle": style.line_style(index), "linewidth": 1.3}
-            panel.plot(seconds, errors_m, marker="o", markersize=3.5, label=comparison.runs[index].estimator, **look)
+    for index, (stamps_ns, errors_m) in found.items():
+        seconds = style.seconds_since_start(comparison, stamps_ns)
+        look = {"color": style.colour(index), "linestyle": style.line_style(index), "linewidth": 1.3}
+        panel.plot(seconds, errors_m, marker="o", markersize=3.5, label=comparison.runs[index].estimator, **look)
     panel.set_ylim(bottom=0.0)
     style.name_axes(panel, TIME_LABEL, "error on its own map (m)")
     style.legend_above(figure, panel)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sonar_graph.errors import EvaluationError
+from sonar_graph.evaluation import compare
 from sonar_graph.evaluation.consistency import reliability, reliability_of
 from sonar_graph.evaluation.results import Comparison, Score
 from sonar_graph.evaluation.scored_instants import published_maps
@@ -15,6 +16,7 @@ from sonar_graph.evaluation.tables import Table, score_keys, score_table
 from sonar_graph.recognition.session import with_detections
 from sonar_graph.report.comparison_page import recognition_content, render_report, write_page, write_report
 from sonar_graph.report.figures import reliability_figure
+from sonar_graph.simulation import BasinOptions, simulate_basin
 from sonar_graph.states import Outcome
 from tests.synthetic import REFUSALS, basin_comparison, only, with_failure, with_run, with_score
 
@@ -110,6 +112,17 @@ def test_without_landmarks_no_figure_of_them_is_announced(comparison):
         assert figures == ["map", "errors", "own_map", "yaw", "nees", "timing"]
         assert html.count(said) == 1
     assert {"growth", "innovations", "nis"} <= set(re.findall(r'<figure id="figure-(\w+)"', render_report(comparison)))
+
+
+def test_truth_that_ends_before_the_measurements_is_shown_as_far_as_it_goes():
+    """The maps of instants after it are not compared with positions that nobody knows."""
+    sequence = simulate_basin(BasinOptions(duration_s=120.0, laps=1))
+    shown = []
+    for share in (1.0, 0.8):
+        truth = sequence.truth.rows(slice(0, round(share * len(sequence.truth))))
+        html = render_report(compare(replace(sequence, truth=truth), ["ekf-slam"]))
+        shown.append(html[html.index('id="figure-own_map"') :].count("<use", 0, 20_000))
+    assert 0 < shown[1] < shown[0]
 
 
 @pytest.mark.parametrize("planar", [True, False], ids=["planar", "3-D"])
