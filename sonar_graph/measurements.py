@@ -315,6 +315,23 @@ class LandmarkDetections(Block):
         return self.candidate_ids[row, best], self.id_probability[row, best]
 
 
+BLOCKS: dict[str, type[Block]] = {
+    "imu": Imu, "dvl": Dvl, "depth": Depth, "detections": LandmarkDetections, "heading": Heading,
+    "positions": PositionFixes,
+}  # fmt: skip
+"""Kind of block of each field of `Measurements` and of `sonar_graph.Sequence`."""
+
+
+def require_blocks(holder: object) -> None:
+    """Raise a `MeasurementError` when a field of `BLOCKS` has a value of another type, and is not None."""
+    for name, kind in BLOCKS.items():
+        block = getattr(holder, name)
+        if block is not None and not isinstance(block, kind):
+            raise MeasurementError(
+                f"{type(holder).__name__}.{name}: expected {kind.__name__} or None, not {type(block).__name__}"
+            )
+
+
 @dataclass(frozen=True)
 class Measurements:
     """Input of `Estimator.process`: all that was measured since the previous call, up to and including ``end_ns``.
@@ -322,7 +339,8 @@ class Measurements:
     Raises
     ------
     MeasurementError
-        When ``end_ns`` is no integer, or a row is stamped after it; rows of IMU and DVL may be.
+        When ``end_ns`` is no integer, a block is of another kind than its field, or a row is stamped after ``end_ns``;
+        rows of IMU and DVL may be.
 
     Examples
     --------
@@ -345,6 +363,7 @@ class Measurements:
                 f"Measurements.end_ns: expected an integer, nanoseconds, not {self.end_ns!r}; of seconds:"
                 " round(seconds * 1e9)"
             )
+        require_blocks(self)
         for rows in (self.depth, self.detections, self.heading, self.positions):
             if rows is not None and rows.stamps_ns[-1] > self.end_ns:
                 raise MeasurementError(

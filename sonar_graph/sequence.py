@@ -12,6 +12,7 @@ import numpy as np
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import (
+    BLOCKS,
     NS_PER_S,
     Block,
     Depth,
@@ -22,6 +23,7 @@ from sonar_graph.measurements import (
     LandmarkDetections,
     Measurements,
     PositionFixes,
+    require_blocks,
 )
 from sonar_graph.states import LandmarkMap, Refusal, RefusedRow, Trajectory
 
@@ -63,6 +65,9 @@ class Sequence:
     notes: dict[str, str] = field(default_factory=dict)
     """Provenance by subject: data set, licence, options of a simulation, seed."""
 
+    def __post_init__(self) -> None:
+        require_blocks(self)
+
     def __repr__(self) -> str:
         known = self.blocks() | {"truth": self.truth, "true_landmarks": self.true_landmarks}
         rows = (f"{len(block)} {name}" for name, block in known.items() if block is not None)
@@ -70,8 +75,7 @@ class Sequence:
 
     def blocks(self) -> dict[str, Block]:
         """Measurements that there are, by their names in `Measurements`."""
-        names = ("imu", "dvl", "depth", "detections", "heading", "positions")
-        return {name: block for name in names if (block := getattr(self, name)) is not None}
+        return {name: block for name in BLOCKS if (block := getattr(self, name)) is not None}
 
     @property
     def true_poses(self) -> Trajectory | None:

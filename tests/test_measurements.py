@@ -250,6 +250,17 @@ def test_the_largest_identity_is_the_last_that_a_key_gives_back():
         gtsam.symbol("l", FIRST_TOO_LARGE_ID)
 
 
+def test_a_block_in_the_place_of_another_is_refused_by_name():
+    heading = Heading(np.array([3]), np.zeros(1), np.ones(1))
+    assert Measurements(5, heading=heading).heading is heading
+    for name in ("imu", "dvl", "depth", "detections", "positions"):
+        kind = {"detections": "LandmarkDetections", "positions": "PositionFixes"}.get(name, name)
+        with pytest.raises(MeasurementError, match=rf"(?i)Measurements\.{name}: expected {kind} or None, not Heading"):
+            Measurements(5, **{name: heading})  # type: ignore[arg-type]
+    with pytest.raises(MeasurementError, match="heading: expected Heading or None, not list"):
+        Measurements(5, heading=[heading])  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize(
     "block",
     [depth([3, 5]), Heading([3, 5], [0, 0], [1, 1]), PositionFixes([3, 5], np.zeros((2, 3)), np.ones((2, 3, 3)))],

@@ -126,8 +126,10 @@ def _map_sentence(comparison: Comparison) -> str:
 
 
 def no_detections(comparison: Comparison) -> str:
-    """The sentence that nothing corrects the drift, in the log or in the chosen part of it."""
+    """The sentence about the drift of a log, or of the chosen part of it, without detections."""
     part = comparison.sequence.notes.get("log.part")
+    if comparison.sequence.heading is not None or comparison.sequence.positions is not None:
+        return "The log has no landmark detections; only its headings and position fixes limit the drift."
     if not part:
         return NO_DETECTIONS
     return f"The part of the log that was chosen ({part}) has no landmark detections; nothing corrects the drift in it."

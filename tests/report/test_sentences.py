@@ -14,6 +14,7 @@ from sonar_graph.evaluation.digits import ABSENT
 from sonar_graph.evaluation.results import MOST_ROWS_NAMED, Comparison, Score
 from sonar_graph.evaluation.scored_instants import published_maps
 from sonar_graph.evaluation.scores import detection_scores, landmark_scores
+from sonar_graph.measurements import Heading
 from sonar_graph.report import sentences
 from sonar_graph.report.comparison_page import render_report
 from sonar_graph.report.console import published_counterpart, summary
@@ -189,6 +190,8 @@ def test_finding_tells_another_smoothed_error_and_that_there_were_no_detections(
     for notes, said in (({}, sentences.NO_DETECTIONS), ({"log.part": "the beginning to 10.000 s"}, part)):
         sequence = replace(comparison.sequence, detections=None, notes=notes)
         assert sentences.finding(replace(comparison, sequence=sequence))[0].startswith(said)
+    aided = replace(comparison.sequence, detections=None, heading=Heading(np.zeros(1, int), np.zeros(1), np.ones(1)))
+    assert "only its headings and position fixes" in sentences.finding(replace(comparison, sequence=aided))[0]
 
 
 def test_failures_come_first_and_the_lack_of_a_finding_has_its_reason():
