@@ -160,13 +160,14 @@ def sigmas(estimator: Isam2, over: Literal["window", "history"], **of: int) -> n
 def logs(data: Path | str | None, *, is_quick: bool) -> Iterator[Sequence]:
     """Logs, one at a time."""
     yield survey(100 if is_quick else 1000)
-    for number in (9,) if is_quick else (9, 6):
+    if is_quick:
+        return
+    for number in (9, 6):
         with recording(data, f"mrclam_ds{number}.tar.xz", f"MRCLAM_Dataset{number}") as folder:
-            for robot in (1,) if is_quick else sorted(int(path.name[5]) for path in folder.glob("Robot?_Odometry.dat")):
+            for robot in sorted(int(path.name[5]) for path in folder.glob("Robot?_Odometry.dat")):
                 yield read_mrclam(folder, robot)
-    if not is_quick:
-        with recording(data, "dlr.tar.xz", "dlr") as folder:
-            yield read_dlr(folder)
+    with recording(data, "dlr.tar.xz", "dlr") as folder:
+        yield read_dlr(folder)
 
 
 def main() -> None:

@@ -148,7 +148,7 @@ def _judged(run: RunResult, comparison: Comparison, true_landmarks: LandmarkMap)
 def _settled(series: ErrorSeries) -> ErrorSeries:
     """Without the first instants, at which the start is still known."""
     kept = series.stamps_ns >= series.stamps_ns[0] + int(SETTLING_S * 1e9)
-    rows = {f.name: getattr(series, f.name)[kept] for f in fields(series) if f.name != "position_dof"}
+    rows = {f.name: rows[kept] for f in fields(series) if isinstance(rows := getattr(series, f.name), np.ndarray)}
     return replace(series, **rows)
 
 
