@@ -7,6 +7,8 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import baselines
 import sonar_graph
 from sonar_graph.evaluation import Comparison, ErrorSeries, RunResult, judge, landmark_errors, rmse, run_estimator
