@@ -15,7 +15,7 @@ processor's caches, which no user's run does.
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 
@@ -31,6 +31,7 @@ from sonar_graph.measurements import LandmarkDetections, Measurements
 from sonar_graph.navigation import Odometry, PreintegratedMotion
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
+from sonar_graph.slam.biases import BIASES, bias_sigmas, by_biases
 from sonar_graph.slam.isam2 import Isam2
 from sonar_graph.slam.models import OdometryWithBias, elevation_on_floor, factors, locate
 from sonar_graph.states import Estimate
@@ -137,16 +138,23 @@ class PlainIsam2:
 
 
 class PlainIsam2WithBias(PlainIsam2):
-    """The same with one gyro bias for the whole run."""
+    """The same with one set of biases for the whole run."""
 
     def _start(self, until_ns: int) -> None:
         super()._start(until_ns)
         if self._node_ns is None:
             return
-        self._values.insert(B(0), NO_BIAS)
-        self._graph.push_back(factors.bias_prior(B(0), self._calibration.imu.gyro_bias_sigma))
+        self._values.insert(B(0), np.zeros(BIASES))
+        self._graph.push_back(factors.bias_prior(B(0), bias_sigmas(self._calibration)[0]))
 
     def _odometry_factor(self, motion: PreintegratedMotion) -> gtsam.NonlinearFactor:
+        dR, dp = motion.i_T_j.rotation().matrix(), motion.i_T_j.translation()
+        up, body_p_dvl = (
+            (self._pose.rotation().matrix() @ dR.T)[2],
+            np.array(self._calibration.dvl.mounting.translation_m),
+        )
+        D = by_biases(motion.D_bias, dR, dp, up, body_p_dvl)
+        motion = replace(motion, D_bias=D, bias=np.zeros(BIASES))
         return OdometryWithBias(X(self._index), X(self._index + 1), B(0), motion)
 
 

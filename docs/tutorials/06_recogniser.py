@@ -50,15 +50,18 @@ for k in range(30):
     step = SonarStep(pose(k - 1).between(pose(k)), np.diag(step_sigma**2)) if k else None
     found = recogniser.process(frame, step, FloorView.from_pose(pose(k), FLOOR_Z_M))
 
-    # 4. What came out: a row for each thing that is seen and trusted; and why all else is not.
+    # 4. What came out: a row for each thing that is seen and trusted, as often as its errors are independent; and why all
+    # else is not.
     if k % 6 == 5:
         print(f"frame {k}: " + "; ".join(sorted({fate.outcome for fate in recogniser.fates})))
-        if found is not None:
-            ids, probability = found.most_probable()
-            for row, (identity, p) in enumerate(zip(ids, probability, strict=True)):
-                sigma_mm = 1e3 * np.sqrt(found.range_azimuth_cov[row, 0, 0])
-                print(f"  landmark {identity} ({p:.2f}) at {found.range_m[row]:.3f} ± {sigma_mm:.1f} mm", end="")
-                print(f", {np.degrees(found.azimuth_rad[row]):.2f}° to the left")
+    if found is not None:
+        ids, probability = found.most_probable()
+        for row, (identity, p) in enumerate(zip(ids, probability, strict=True)):
+            sigma_mm = 1e3 * np.sqrt(found.range_azimuth_cov[row, 0, 0])
+            print(f"frame {k}: landmark {identity} ({p:.2f}) at {found.range_m[row]:.3f} ± {sigma_mm:.1f} mm", end="")
+            print(f", {np.degrees(found.azimuth_rad[row]):.2f}° to the left")
+        true = pose(k).transformTo(landmark)
 
-true = pose(29).transformTo(landmark)
-print(f"true: landmark {design.id} at {np.linalg.norm(true):.3f} m, {np.degrees(np.arctan2(true[1], true[0])):.2f}°")
+print(
+    f"true, of the last: landmark {design.id} at {np.linalg.norm(true):.3f} m, {np.degrees(np.arctan2(true[1], true[0])):.2f}°"
+)
