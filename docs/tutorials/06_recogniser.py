@@ -50,8 +50,7 @@ for k in range(30):
     step = SonarStep(pose(k - 1).between(pose(k)), np.diag(step_sigma**2)) if k else None
     found = recogniser.process(frame, step, FloorView.from_pose(pose(k), FLOOR_Z_M))
 
-    # 4. What came out: a row for each thing that is seen and trusted, as often as its errors are independent; and why all
-    # else is not.
+    # 4. What came out: a row for each thing that is seen and trusted, as often as errors are independent; and why no more.
     if k % 6 == 5:
         print(f"frame {k}: " + "; ".join(sorted({fate.outcome for fate in recogniser.fates})))
     if found is not None:
