@@ -50,7 +50,7 @@ for k in range(30):
     step = SonarStep(pose(k - 1).between(pose(k)), np.diag(step_sigma**2)) if k else None
     found = recogniser.process(frame, step, FloorView.from_pose(pose(k), FLOOR_Z_M))
 
-    # 4. What came out: a row for each thing that is seen and trusted, as often as errors are independent; and why no more.
+    # 4. What came out: a row for each thing seen and trusted, as often as errors are independent, and why no more.
     if k % 6 == 5:
         print(f"frame {k}: " + "; ".join(sorted({fate.outcome for fate in recogniser.fates})))
     if found is not None:
@@ -61,6 +61,5 @@ for k in range(30):
             print(f", {np.degrees(found.azimuth_rad[row]):.2f}° to the left")
         true = pose(k).transformTo(landmark)
 
-print(
-    f"true, of the last: landmark {design.id} at {np.linalg.norm(true):.3f} m, {np.degrees(np.arctan2(true[1], true[0])):.2f}°"
-)
+azimuth_deg = np.degrees(np.arctan2(true[1], true[0]))
+print(f"true, of the last: landmark {design.id} at {np.linalg.norm(true):.3f} m, {azimuth_deg:.2f}°")
