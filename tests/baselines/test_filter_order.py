@@ -1,0 +1,204 @@
+"""Laws of the calls: order, cuts, refusals and outcomes of what a filter is given."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from baselines.event_order import DEPTH, END, EPOCH, FIX, FRAME, GRAVITY, HEADING, PLANE, in_order
+from baselines.sonar_update import USED
+from sonar_graph.calibration import Calibration, FloorPrior, SonarCalibration
+from sonar_graph.errors import EstimatorError, MeasurementError
+from sonar_graph.measurements import NS_PER_S, Measurements
+from sonar_graph.navigation import Odometry
+from sonar_graph.sequence import Sequence
+from sonar_graph.slam.landmarks import ACCEPTED
+from sonar_graph.states import CausalEstimates, Estimate, Outcome, Refusal
+
+from .runs import T0_NS, aided, begun, depths, dvl, imu, in_a_gap, later, run, seen, slam_filters, state_of
+
+
+def test_causal_estimates_keep_the_later_answer_and_time_never_runs_back():
+    said = CausalEstimates()
+    assert len(said.trajectory()) == 0
+    for stamp_ns, x in ((1, 0.1), (2, 0.2), (2, 0.3), (1, 0.4), (3, 0.5)):
+        said.keep(Estimate(stamp_ns, gtsam.Pose3(gtsam.Rot3(), np.array([x, 0.0, 0.0])), np.eye(6)))
+    assert said.trajectory().stamps_ns.tolist() == [1, 2, 3]
+    assert said.trajectory().positions[:, 0].tolist() == [0.1, 0.3, 0.5]
+
+
+@slam_filters
+def test_a_refused_row_of_a_frame_changes_nothing(kind):
+    """Beside an accepted one of a landmark in the state, before and after it."""
+    first, states = seen(later(0.4, 0.5)), []
+    both = replace(seen(later(0.8, 0.8, 0.8), 2.01), id_probability=np.array([[0.8], [0.9], [0.3]]))
+    for frame in (both, both.rows(slice(1, 2))):
+        slam = begun(kind, Calibration())
+        slam.process(Measurements(later(0.6), imu(0.6), dvl(0.6), None, first))
+        slam.process(Measurements(later(1.0), imu(1), dvl(1), None, frame))
+        states.append(state_of(slam))
+    assert slam.detections().outcomes[-1] is Outcome.USED
+    for part, same in zip(*states, strict=True):
+        assert_array_equal(part, same)
+
+
+@slam_filters
+def test_a_question_while_beams_are_few_changes_nothing_later(kind):
+    """A call that ends before few-beam rows are completed sees a gap where later there is none."""
+    velocity = dvl(12, (0.3, 0.0, 0.0))
+    cov = np.tile(np.eye(3), (len(velocity), 1, 1))
+    cov[25:36, 2, 2] = np.inf
+    rows, views = (imu(12), replace(velocity, velocity_cov=cov)), seen(later(1.0, 3.0, 9.0, 10.0, 11.5), range_m=3.0)
+    precise = Calibration(sonar=SonarCalibration(range_sigma_m=1e-3, azimuth_sigma_rad=1e-3))
+    states = []
+    for cuts in ((12.0,), (7.0, 12.0), (6.1, 6.9, 12.0)):
+        slam, before_ns = begun(kind, precise, gate_probability=1.0), T0_NS - 1
+        for end_ns in (later(cut) for cut in cuts):
+            parts = [block.between(before_ns, end_ns) for block in (*rows, views)]
+            slam.process(Measurements(end_ns, parts[0], parts[1], None, parts[2]))
+            before_ns = end_ns
+        states.append((*state_of(slam), slam.detections().innovation_covs))
+    for other in states[1:]:
+        for part, same in zip(other, states[0], strict=True):
+            assert_array_equal(part, same)
+
+
+@slam_filters
+def test_each_detection_has_its_outcome_and_a_refused_one_changes_nothing(kind):
+    """Before the first node, without a probable identity, older than what is done, and outside the gate."""
+    slam = begun(kind, Calibration(), gate_probability=0.999)
+    assert slam.process(Measurements(T0_NS - 5, None, None, None, seen([T0_NS - 10]))) is None
+    end_ns = later(1.0)
+    slam.process(Measurements(end_ns, imu(1), dvl(1), None, seen([later(0.5)])))
+    before = state_of(slam)
+    slam.process(Measurements(end_ns, None, None, None, seen([end_ns], landmark=4, probability=0.3)))
+    slam.process(Measurements(end_ns, None, None, None, seen([later(0.25)])))
+    slam.process(Measurements(end_ns, None, None, None, seen([end_ns], range_m=2.5)))
+    for part, same in zip(state_of(slam), before, strict=True):
+        assert_array_equal(part, same)
+    expected = [Outcome.UNLOCATED, Outcome.NEW, Outcome.NO_IDENTITY, Outcome.LATE, Outcome.GATED]
+    log = slam.detections()
+    assert log.outcomes == expected
+    assert log.landmark_ids.tolist() == [3, 3, 4, 3, 3]
+    assert log.innovations[4] == pytest.approx([0.5, 0.0], abs=1e-6)
+    assert np.isnan(log.innovations[:4]).all()
+    assert slam.landmarks().ids.tolist() == [3]
+
+
+@slam_filters
+def test_a_filter_that_refuses_what_most_detections_say_says_so_and_follows_them(kind):
+    """A landmark stands 0.5 m farther than first seen; however the log is cut, and not after one outlier."""
+    t = np.concatenate([[0.5], np.arange(1.0, 9.0, 0.25)])
+    far_m, states = 2.0 + 0.5 * (t >= 2.0), []
+    for cuts in ((9.0,), (1.6, 4.1, 4.2, 9.0)):
+        slam, before_ns = begun(kind, Calibration(), gate_probability=0.999), T0_NS - 1
+        for end_ns in (later(cut) for cut in cuts):
+            rows = [block.between(before_ns, end_ns) for block in (imu(9), dvl(9), seen(later(*t), range_m=far_m))]
+            slam.process(Measurements(end_ns, rows[0], rows[1], None, rows[2]))
+            before_ns = end_ns
+        states.append(state_of(slam))
+    for part, same in zip(*states, strict=True):
+        assert_array_equal(part, same)
+    outcomes = slam.detections().outcomes
+    assert outcomes[5:10] == [Outcome.GATED] * 5
+    assert outcomes[10] is Outcome.LET_IN
+    assert outcomes[-1] is Outcome.USED
+    assert np.abs(slam.detections().innovations[-1, 0]) < 0.1
+    (message,) = slam.withheld()
+    assert f"first at {later(t[10])} ns" in message
+    assert "the gate may be the cause" in message
+    calm = run(kind, Sequence("one outlier", Calibration(), imu(9), dvl(9), None, seen(later(*t), 2.0 + (t == 4.0))))
+    assert calm.withheld() == []
+
+
+@slam_filters
+def test_a_row_of_motion_that_was_used_comes_too_late_and_changes_nothing(kind):
+    slam, late = begun(kind, Calibration()), dvl(2, (0.1, 0.0, 0.0), rate_hz=7).rows(slice(9, 10))
+    slam.process(Measurements(later(2.0), imu(2), dvl(2)))
+    before = state_of(slam)
+    slam.process(Measurements(later(2.0), None, late))
+    (row,) = slam.refused_rows()
+    assert (row.sensor, row.stamp_ns, row.reason) == ("dvl", late.stamps_ns[0], Refusal.LATE)
+    for part, same in zip(state_of(slam), before, strict=True):
+        assert_array_equal(part, same)
+
+
+@pytest.mark.parametrize("rows", [{"detections": seen([T0_NS + 1])}, {"depth": depths(np.array([T0_NS + 1]), 0.0)}])
+def test_a_row_after_the_instant_is_an_error_that_names_it(rows):
+    (block,) = rows.values()
+    with pytest.raises(MeasurementError, match=f"{type(block).__name__} has a row at {T0_NS + 1} ns, after end_ns"):
+        Measurements(T0_NS, **rows)
+
+
+@slam_filters
+def test_many_landmarks_stay_where_they_were_seen(kind):
+    """More than the first arrays have room for, seen in the order of their identities turned round."""
+    slam, end_ns = begun(kind, Calibration(floor=FloorPrior(z_m=-1.0, sigma_m=0.01))), later(1.0)
+    slam.process(Measurements(end_ns, imu(1), dvl(1)))
+    for landmark in reversed(range(20)):
+        slam.process(Measurements(end_ns, None, None, None, seen([end_ns], 4.0, 0.05 * landmark, landmark)))
+    found = slam.landmarks()
+    assert_array_equal(found.ids, np.arange(20))
+    assert_allclose(np.arctan2(found.positions[:, 1], found.positions[:, 0]), 0.05 * np.arange(20), atol=1e-3)
+    assert slam.detections().outcomes == [Outcome.NEW] * 20
+
+
+@slam_filters
+@pytest.mark.parametrize("with_aiding", [False, True])
+def test_the_outcome_depends_neither_on_how_the_log_is_cut_nor_on_being_asked(mission, kind, with_aiding):
+    """To the last bit, over gaps of the Doppler log and intervals of gravity, with headings and position fixes."""
+    mission = aided(mission) if with_aiding else mission
+    instants = mission.instants(0.1)
+    instants = instants[instants < mission.start_ns + 35 * NS_PER_S]
+    stamps = np.concatenate([block.stamps_ns for block in mission.blocks().values()])
+    every_instant = np.unique(np.concatenate([stamps, mission.instants(50.0)]))
+    live, windows, whole = (begun(kind, mission.calibration, gravity_interval_s=7.0) for _ in range(3))
+    for row in mission.replay(every_instant[every_instant <= instants[-1]]):
+        live.process(row)
+    for window in mission.replay(instants):
+        windows.process(window)
+    for window in mission.replay(instants[-1:]):
+        whole.process(window)
+    assert sorted(live.refused_rows()) == sorted(windows.refused_rows())
+    unsound = {row.sensor for row in live.refused_rows() if row.reason is Refusal.UNSOUND}
+    assert unsound == ({"heading", "positions"} if with_aiding else set())
+    for other in (windows, whole):
+        assert live.detections().outcomes == other.detections().outcomes
+        for part, same in zip(state_of(live), state_of(other), strict=True):
+            assert_array_equal(part, same)
+        at = np.searchsorted(live.trajectory().stamps_ns, other.trajectory().stamps_ns)
+        assert_array_equal(live.trajectory().positions[at], other.trajectory().positions)
+        assert_array_equal(live.trajectory().covariances[at], other.trajectory().covariances)
+
+
+def test_events_come_in_the_order_of_their_stamps_each_with_its_motion_from_the_newest_epoch():
+    """At equal stamps epoch, plane, gravity, depth, heading, fix, frame; gravity where its interval is long enough."""
+    samples = np.array([[3, 10, 20, 20, 20, 50], [*[DEPTH] * 3, HEADING, FIX, DEPTH], [0, 1, 2, 0, 1, 3]])
+    seen = np.array([18, 20, 20, 45, 45])
+    outcome = np.array([*[ACCEPTED] * 3, USED, ACCEPTED], np.int8)
+
+    def events(interval_ns, is_planar=False):
+        epochs, reached, out = np.array([19, 39, 57]), np.array([20, 40, 58]), np.empty((5, 30), np.int64)
+        n = in_order(epochs, reached, samples, seen, outcome, 10, 60, 5, 5, interval_ns, is_planar, out)
+        return list(map(tuple, out[:, :n].T.tolist()))
+
+    expected = [
+        (10, 5, 10, DEPTH, 1), (18, 5, 18, FRAME, 0), (20, 5, 19, EPOCH, 0), (20, 19, 20, DEPTH, 2),
+        (20, 19, 20, HEADING, 0), (20, 19, 20, FIX, 1),
+        (20, 19, 20, FRAME, 1), (40, 19, 39, EPOCH, 1), (40, 39, 39, GRAVITY, 0), (45, 39, 45, FRAME, 4),
+        (50, 39, 50, DEPTH, 3), (58, 39, 57, EPOCH, 2), (60, 57, 60, END, 0),
+    ]  # fmt: skip
+    assert events(34) == expected
+    assert events(0) == [event for event in expected if event[3] != GRAVITY]
+    assert [event[3] for event in events(14, is_planar=True)[3:6]] == [PLANE, GRAVITY, DEPTH]
+    assert [event[3] for event in events(14)].count(GRAVITY) == 3
+
+
+@slam_filters
+def test_an_innovation_that_a_source_of_motion_lets_be_impossible_is_an_error_with_its_time(kind, monkeypatch):
+    """Ours refuses such rows; that of somebody else may not."""
+    monkeypatch.setattr(Odometry, "used_depths", lambda _, depth: depth)
+    with pytest.raises(EstimatorError, match=rf"{kind.name}: between \d+ and \d+ ns .* variances above zero"):
+        run(kind, in_a_gap(depths(np.array([later(1.0)]), 1.0, -1e6)))
