@@ -7,8 +7,8 @@ import gtsam
 import numpy as np
 from pydantic import Field
 
-from sonar_graph.calibration import Calibration, Section
-from sonar_graph.measurements import Floats, Measurements
+from sonar_graph.calibration import Calibration, Section, require_params
+from sonar_graph.measurements import Floats, Measurements, require_measurements
 from sonar_graph.motion import MotionSource, PreintegratedMotion, require_source
 from sonar_graph.navigation.alignment import gravity_direction
 from sonar_graph.states import (
@@ -65,6 +65,7 @@ class DeadReckoning:
         self, calibration: Calibration, odometry: MotionSource, params: DeadReckoningParams | None = None
     ) -> None:
         require_source(odometry, calibration, "DeadReckoning(calibration, odometry, params)")
+        require_params(params, self.Params, "dead-reckoning")
         self._params = params or DeadReckoningParams()
         self._odometry, self._calibration = odometry, calibration
         has_bias = calibration.imu.gyro_bias_sigma > 0
@@ -87,6 +88,7 @@ class DeadReckoning:
 
         None before the first DVL stamp that IMU rows cover from both sides.
         """
+        require_measurements(measurements, "dead-reckoning")
         self._odometry.add(measurements.imu, measurements.dvl)
         self._odometry.used_depths(measurements.depth)  # not used here, but judged and named as by every estimator
         if (detections := measurements.detections) is not None:

@@ -7,7 +7,7 @@ docs/theory/ekf_slam.md.
 
 import math
 from abc import ABC, abstractmethod
-from typing import Any
+from typing import Any, ClassVar
 
 import gtsam
 import numpy as np
@@ -37,9 +37,18 @@ from baselines.event_order import (
     remove_rate,
 )
 from baselines.sonar_update import JUDGED_TOGETHER, NEW, Gate, SonarModel, read
-from sonar_graph.calibration import Calibration, PlanarMotion, Section
+from sonar_graph.calibration import Calibration, PlanarMotion, Section, require_params
 from sonar_graph.errors import EstimatorError
-from sonar_graph.measurements import Depth, Floats, Heading, Ints, LandmarkDetections, Measurements, PositionFixes
+from sonar_graph.measurements import (
+    Depth,
+    Floats,
+    Heading,
+    Ints,
+    LandmarkDetections,
+    Measurements,
+    PositionFixes,
+    require_measurements,
+)
 from sonar_graph.motion import MotionSource, require_source
 from sonar_graph.navigation.alignment import earth_rate_in_world, tilt_sigma
 from sonar_graph.slam.landmarks import MINIMUM_PROBABILITY, identify
@@ -79,9 +88,11 @@ class FilterShell(ABC):
     """Estimator around the mathematics of a filter, which a subclass adds; `name` stands in messages."""
 
     name: str
+    Params: ClassVar[type[Section]]
 
     def __init__(self, calibration: Calibration, odometry: MotionSource, params: FilterParams) -> None:
         require_source(odometry, calibration, f"{type(self).__name__}(calibration, odometry, params)")
+        require_params(params, self.Params, self.name)
         self.calibration, self.odometry = calibration, odometry
         self.sonar = SonarModel.of(calibration, Gate.of(params.gate_probability, params.kernel_width))
         self.port = np.array(calibration.depth.port_m)
@@ -166,6 +177,7 @@ class FilterShell(ABC):
         EstimatorError
             When the state has no meaning any more, or a variance makes an innovation's covariance not positive.
         """
+        require_measurements(measurements, self.name)
         end_ns, detections = measurements.end_ns, measurements.detections
         self.odometry.add(measurements.imu, measurements.dvl)
         depth = self.odometry.used_depths(measurements.depth)

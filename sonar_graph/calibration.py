@@ -4,11 +4,14 @@ A `Calibration` travels inside the log (a metadata record) or comes from a TOML 
 in its name or docstring. Every estimator gets the same one.
 """
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import gtsam
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic._internal._model_construction import ModelMetaclass
+
+from sonar_graph.errors import EstimatorError, SettingError, expectation
 
 STANDARD_GRAVITY = 9.80665
 HOLE_INTERVALS, SHORTEST_HOLE_S = 5, 0.05
@@ -41,10 +44,45 @@ Vector = tuple[Number, Number, Number]
 Sigmas = tuple[NotNegative, NotNegative, NotNegative]
 
 
-class Section(BaseModel):
+class SectionType(ModelMetaclass):
+    """Type of the sections: making one by hand from wrong values is a `SettingError` that names each field."""
+
+    def __call__(cls, *args: Any, **values: Any) -> Any:  # noqa: N805
+        """Make a section."""
+        try:
+            return super().__call__(*args, **values)
+        except ValidationError as error:
+            faults = []
+            for fault in error.errors():
+                told = f"{expectation(fault['type'], fault['msg'])}, not {fault['input']!r:.60}"
+                if fault["type"] == "extra_forbidden":
+                    known = getattr(cls, "model_fields", {}) if len(fault["loc"]) == 1 else {}
+                    told = "there is no such field" + f"; there are: {', '.join(known)}" * bool(known)
+                faults.append(f"{cls.__name__}.{'.'.join(map(str, fault['loc']))}: {told}")
+            raise SettingError("; ".join(faults)) from None
+
+
+class Section(BaseModel, metaclass=SectionType):
     """A frozen group of settings that refuses names it does not know."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Refuse to change a setting."""
+        try:
+            super().__setattr__(name, value)
+        except ValidationError:
+            changed = f"model_copy(update={{{name!r}: ...}})"
+            raise SettingError(f"{type(self).__name__}.{name} cannot be set; {changed} makes a changed one") from None
+
+
+def require_params(params: object, kind: type[Section], name: str) -> None:
+    """Raise an `EstimatorError` where an estimator's settings are neither None nor of their kind."""
+    if params is not None and not isinstance(params, kind):
+        given = f"the class {params.__name__}" if isinstance(params, type) else type(params).__name__
+        raise EstimatorError(
+            f"{name}: params: expected {kind.__name__} or None, not {given}; of a dict: {kind.__name__}(**params)"
+        )
 
 
 class Mounting(Section):
@@ -214,3 +252,11 @@ class Calibration(Section):
     gravity_m_s2: Gravity = STANDARD_GRAVITY
     earth_rate_latitude_rad: Latitude | None = None
     """Latitude for removing the Earth's rotation from the gyros (world x east, y north); None: not removed."""
+
+
+def require_calibration(value: object, call: str) -> None:
+    """Raise a TypeError that names the ``call`` where its first argument is no `Calibration`."""
+    if not isinstance(value, Calibration):
+        raise TypeError(
+            f"{call}: expected a Calibration, not {type(value).__name__}; of a dict: Calibration.model_validate(values)"
+        )

@@ -4,6 +4,8 @@ Each message says what was asked, what was found, and what to do. The command li
 with 2; only an unforeseen error ends in a traceback.
 """
 
+import re
+
 MISFIT = "misfit"
 """Type of a validation error whose message alone says all."""
 
@@ -18,6 +20,10 @@ class MeasurementError(SonarGraphError):
 
 class CalibrationError(SonarGraphError):
     """A calibration is missing or impossible."""
+
+
+class SettingError(SonarGraphError, ValueError):
+    """A section of settings is made with a value that does not fit, or changed."""
 
 
 class SimulationError(SonarGraphError):
@@ -54,3 +60,22 @@ class EvaluationError(SonarGraphError):
 
 class BatchError(SonarGraphError):
     """A suite of runs has a mistake, or the batch cannot go on."""
+
+
+EXPECTED = {
+    "model_type": "a section", "dict_type": "a section", "tuple_type": "a list", "list_type": "a list",
+    "bool_type": "true or false", "bool_parsing": "true or false", "string_type": "a text",
+    "float_type": "a number", "float_parsing": "a number", "int_type": "an integer", "int_parsing": "an integer",
+    "int_from_float": "an integer",
+}  # fmt: skip
+"""Words for what a field holds, by the type of a validation error."""
+
+
+def expectation(kind: str, message: str) -> str:
+    """Text of a validation error of this type, without the words of the library that found it."""
+    if kind in EXPECTED:
+        return f"expected {EXPECTED[kind]}"
+    message = message.removeprefix("Value error, ")
+    return re.sub("^Input should be (?=(greater|less))", "expected a number ", message).replace(
+        "Input should be", "expected", 1
+    )

@@ -123,6 +123,15 @@ def load_estimator(name: str) -> type[Estimator]:
     'EkfSlam'
     """
     installed = installed_estimators()
+    asked: Any = name
+    if not isinstance(asked, str):
+        kind = asked if isinstance(asked, type) else type(asked)
+        same = [own for own, point in installed.items() if point.value == f"{kind.__module__}:{kind.__name__}"]
+        given = f"the class {kind.__name__}" if kind is asked else f"{asked!r:.60}"
+        raise UnknownEstimatorError(
+            f"expected the name of an installed estimator, not {given}; give"
+            f" {' or '.join(map(repr, same or installed))}, or announce your own as sonar_graph.estimator says"
+        )
     if name not in installed:
         known = ", ".join(installed) or "none; reinstall the package"
         raise UnknownEstimatorError(f"no estimator is called {name!r}{suggestion(name, installed)} installed: {known}")
@@ -143,4 +152,8 @@ def make_params(estimator: type[Estimator], overrides: dict[str, Any], name: str
     nested, ``{"identity": {"policy": "gate"}}``. Raises `EstimatorError` naming the setting that does not exist or does
     not fit, and those that exist.
     """
+    given: Any = overrides
+    if not isinstance(given, dict):
+        advice = "params.model_dump()" if isinstance(given, Section) else '{"name": value}'
+        raise EstimatorError(f"settings of {name}: expected a dict, not {type(given).__name__}; give {advice}")
     return parse(estimator.Params, nested(overrides), f"settings of {name}", EstimatorError)

@@ -19,6 +19,11 @@ from sonar_graph.errors import MeasurementError
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 NS_PER_S = 1_000_000_000
+PAUSE_NS = 86_400 * NS_PER_S
+"""A day. No log pauses so long: between rows farther apart a clock was set, and the part with more rows counts."""
+FASTEST_NS = 1e4
+"""Shortest mean time between rows of any sensor: 100,000 a second."""
+STAMP_ADVICE = "stamps are nanoseconds; of seconds: np.round(seconds * 1e9).astype(np.int64)"
 NO_TRACK = -1
 """Track number of a detection that belongs to no track."""
 ROUNDING = 1e-6
@@ -95,6 +100,11 @@ class Block:
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({len(self)} rows, {self.stamps_ns[0]} to {self.stamps_ns[-1]} ns)"
+
+    def is_too_fast(self) -> bool:
+        """True where stamps, at least ten, follow each other faster than any sensor measures."""
+        stamps_ns = np.unique(self.stamps_ns)
+        return len(stamps_ns) >= 10 and bool(stamps_ns[-1] - stamps_ns[0] < FASTEST_NS * (len(stamps_ns) - 1))
 
     def rows(self, selection: slice | NDArray[np.bool_] | Ints) -> Self:
         """The block with only the selected rows."""
@@ -339,8 +349,8 @@ class Measurements:
     Raises
     ------
     MeasurementError
-        When ``end_ns`` is no integer, a block is of another kind than its field, or a row is stamped after ``end_ns``;
-        rows of IMU and DVL may be.
+        When ``end_ns`` is no integer, a block is of another kind than its field, or a row is stamped after ``end_ns``
+        (rows of IMU and DVL may be) or more than a day before all else.
 
     Examples
     --------
@@ -364,9 +374,27 @@ class Measurements:
                 " round(seconds * 1e9)"
             )
         require_blocks(self)
+        motion_ns = min([self.end_ns, *(int(rows.stamps_ns[0]) for rows in (self.imu, self.dvl) if rows is not None)])
         for rows in (self.depth, self.detections, self.heading, self.positions):
-            if rows is not None and rows.stamps_ns[-1] > self.end_ns:
+            if rows is None:
+                continue
+            if rows.stamps_ns[0] < motion_ns - PAUSE_NS:
+                raise MeasurementError(
+                    f"Measurements: {type(rows).__name__} has a row at {rows.stamps_ns[0]} ns, more than a day before"
+                    f" {motion_ns} ns, where IMU, Doppler log or the call have theirs; {STAMP_ADVICE}"
+                )
+            if rows.stamps_ns[-1] > self.end_ns:
                 raise MeasurementError(
                     f"Measurements: {type(rows).__name__} has a row at {rows.stamps_ns[-1]} ns, after end_ns ="
                     f" {self.end_ns}; hand it in with the call that reaches it"
                 )
+
+
+def require_measurements(value: object, name: str) -> None:
+    """Raise a `MeasurementError` where an estimator of this name is given something else to process."""
+    if not isinstance(value, Measurements):
+        block = next((field for field, kind in BLOCKS.items() if isinstance(value, kind)), "imu")
+        raise MeasurementError(
+            f"{name}: process(measurements): expected Measurements, not {type(value).__name__}; of blocks:"
+            f" Measurements(end_ns, {block}=...)"
+        )

@@ -17,7 +17,7 @@ from typing import NamedTuple, Protocol
 
 import gtsam
 
-from sonar_graph.calibration import Calibration
+from sonar_graph.calibration import Calibration, require_calibration
 from sonar_graph.errors import CalibrationError
 from sonar_graph.measurements import Depth, Dvl, Floats, Imu, Ints
 from sonar_graph.states import RefusedRow
@@ -75,7 +75,8 @@ class PreintegratedMotion:
 
 
 def require_source(odometry: object, calibration: Calibration, call: str) -> None:
-    """Refuse what is no source of motion (TypeError), or was made with another calibration (CalibrationError)."""
+    """Refuse what is no calibration, no source of motion (TypeError), or made with another (CalibrationError)."""
+    require_calibration(calibration, call)
     if isinstance(odometry, type) or not hasattr(odometry, "motions"):
         given = odometry.__name__ if isinstance(odometry, type) else type(odometry).__name__
         raise TypeError(f"{call}: expected a source of motion, such as Odometry(calibration), not {given}")

@@ -25,10 +25,8 @@ from sonar_graph.measurements import (
     PositionFixes,
     require_blocks,
 )
+from sonar_graph.measurements import PAUSE_NS as PAUSE_NS
 from sonar_graph.states import LandmarkMap, Refusal, RefusedRow, Trajectory
-
-PAUSE_NS = 86_400 * NS_PER_S
-"""A day. No log pauses so long: between rows farther apart a clock was set, and the part with more rows counts."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -93,9 +91,15 @@ class Sequence:
         return min(_longest_part(self.imu.stamps_ns)[1], _longest_part(self.dvl.stamps_ns)[1])
 
     def off_the_clock(self) -> list[RefusedRow]:
-        """Rows more than a day before the start or after the end, which `replay` leaves out."""
+        """Rows more than a day before the start or after the end, which `replay` leaves out, or that are too fast."""
         first_ns, last_ns = self.start_ns - PAUSE_NS, self.end_ns + PAUSE_NS
-        return [
+        too_fast = [
+            RefusedRow(sensor, stamp_ns, Refusal.RATE, math.nan)
+            for sensor, block in self.blocks().items()
+            if block.is_too_fast() and first_ns < block.stamps_ns[0]
+            for stamp_ns in block.stamps_ns.tolist()
+        ]
+        return too_fast + [
             RefusedRow(sensor, stamp_ns, Refusal.CLOCK, math.nan)
             for sensor, block in self.blocks().items()
             if block.stamps_ns[0] <= first_ns or block.stamps_ns[-1] > last_ns

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, TypeVar, Union, get_args, get_origin
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from sonar_graph.errors import MISFIT, CalibrationError
+from sonar_graph.errors import MISFIT, CalibrationError, expectation
 
 Place = tuple[int | str, ...]
 _SHOWN_CHARACTERS = 60
@@ -133,7 +133,10 @@ def _describe(error: ErrorDetails, model: type[BaseModel]) -> str:
         return f"{_path(place)}: expected a list of tables, [[{_path(place)}]] in TOML, not one table"
     if error["type"] == "too_long" and not isinstance(error["input"], str):
         return f"{_path(place)}: expected {error['ctx']['max_length']} values, not {_shown(error['input'])}"
-    message = error["msg"].removeprefix("Value error, ")
+    message = expectation(error["type"], error["msg"])
+    if error["type"] == "model_type":
+        like = f"[{_path(place)}] in TOML" if place else "such as " + ", ".join(list(model.model_fields)[:3])
+        message = f"expected {'a section' if place else 'sections'}, {like}"
     return f"{_path(place)}: {message}, not {_shown(error['input'])}" if place else message
 
 
@@ -177,6 +180,8 @@ def _is_short_list(error: ErrorDetails) -> bool:
 
 
 def _shown(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()  # as files have it
     text = repr(list(value) if isinstance(value, tuple) else value)
     return text if len(text) <= _SHOWN_CHARACTERS else f"{text[:_SHOWN_CHARACTERS]}..."
 

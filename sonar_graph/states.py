@@ -248,7 +248,10 @@ class Refusal(StrEnum):
     INCOMPLETE = "refused: too few beams, and nothing to complete them with"
     BEYOND_SENSOR = "refused: no gyro or accelerometer measures this"
     OUT_OF_REACH = "refused: no vehicle reaches this depth from the last, or no other depth confirms it"
-    CLOCK = "refused: more than a day from the rows that follow or precede; was the clock set between?"
+    CLOCK = (
+        "refused: more than a day from the rows that follow or precede; was the clock set between, or are these not ns?"
+    )
+    RATE = "not used: stamps follow each other faster than any sensor measures; are they nanoseconds?"
 
 
 class RefusedRow(NamedTuple):

@@ -4,9 +4,12 @@ from typing import ClassVar
 import pytest
 
 from sonar_graph import estimator as module
-from sonar_graph.calibration import Section
+from sonar_graph.calibration import Calibration, Section
 from sonar_graph.errors import EstimatorError, UnknownEstimatorError
 from sonar_graph.estimator import Estimator, installed_estimators, load_estimator, make_params
+from sonar_graph.evaluation import compare, run_estimator
+from sonar_graph.navigation import Odometry
+from sonar_graph.testing import small_world
 
 
 class Nothing:
@@ -61,7 +64,7 @@ def test_settings_replace_defaults_one_by_one_and_a_wrong_one_is_refused_with_th
     assert make_params(Nothing, {"gain": 2}, "nothing") == Nothing.Params(gain=2.0)  # type: ignore[arg-type]
     for settings, said in (
         ({"gian": 1}, r"gian: .* did you mean gain\? it has: gain, name"),
-        ({"gain": "high"}, r"gain: .* number, .* not 'high'"),
+        ({"gain": "high"}, r"gain: expected a number, not 'high'"),
     ):
         with pytest.raises(EstimatorError, match=f"settings of nothing: {said}"):
             make_params(Nothing, settings, "nothing")  # type: ignore[arg-type]
@@ -70,3 +73,19 @@ def test_settings_replace_defaults_one_by_one_and_a_wrong_one_is_refused_with_th
 def test_protocol_is_told_apart_by_its_methods():
     assert isinstance(Nothing(), Estimator)
     assert not isinstance(OnlyTrajectory(), Estimator)
+
+
+def test_a_class_or_an_instance_in_the_place_of_a_name_is_answered_with_its_name():
+    kind = load_estimator("ekf-slam")
+    for asked, said in (
+        (kind, "not the class EkfSlam; give 'ekf-slam', or announce"),
+        (kind(Calibration(), Odometry(Calibration())), "not <.*EkfSlam object.*; give 'ekf-slam', or"),
+        (Nothing, "not the class Nothing; give 'dead-reckoning' or 'ekf-slam' or"),
+        (None, "not None; give 'dead-reckoning'"),
+    ):
+        for run in (lambda name: run_estimator(small_world(), name), lambda name: compare(small_world(), [name])):
+            with pytest.raises(UnknownEstimatorError, match=f"expected the name of an installed estimator, {said}"):
+                run(asked)
+    for settings, said in (("gain=2", 'not str; give {"name": value}'), (kind.Params(), r"give params.model_dump\(\)")):
+        with pytest.raises(EstimatorError, match=f"settings of ekf-slam: expected a dict, .*{said}"):
+            run_estimator(small_world(), "ekf-slam", settings)  # type: ignore[arg-type]

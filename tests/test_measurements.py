@@ -11,6 +11,7 @@ from hypothesis.extra import numpy as arrays
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import (
     FIRST_TOO_LARGE_ID,
+    PAUSE_NS,
     UNMEASURED_M2,
     Depth,
     Dvl,
@@ -305,3 +306,13 @@ def test_a_fix_and_its_sigma_are_within_a_quarter_of_the_earth_s_circumference(a
         positions, covs = np.zeros((2, 3)), np.stack([np.eye(3)] * 2)
         positions[0, axis], covs[0, axis, axis] = at, variance
         assert PositionFixes([0, 1], positions, covs).are_sound().tolist() == [is_sound, True]
+
+
+@pytest.mark.parametrize("block", [Heading([20], [0], [1]), PositionFixes([20], np.zeros((1, 3)), np.ones((1, 3, 3)))])
+def test_rows_more_than_a_day_before_all_else_are_refused_by_name_as_stamps_in_seconds(block):
+    """Of the call's end or its first motion, for a whole log may be one call."""
+    field, now_ns = ("heading" if isinstance(block, Heading) else "positions"), PAUSE_NS + 21
+    with pytest.raises(MeasurementError, match=rf"{type(block).__name__} has a row at 20 ns, .*of seconds: np.round"):
+        Measurements(now_ns, **{field: block})
+    Measurements(now_ns - 1, **{field: block})
+    Measurements(now_ns, imu=Imu([PAUSE_NS], np.zeros((1, 3)), np.zeros((1, 3))), **{field: block})

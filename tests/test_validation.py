@@ -44,7 +44,7 @@ def test_a_list_of_another_length_is_told_once_with_the_length_expected(values):
 
 def test_other_faults_name_field_expectation_and_value():
     assert told("wind = 3").startswith("wind: there is no such field; it has: imu, dvl"), "it resembles nothing"
-    assert told("depth.sigma_m = -1.0") == "depth.sigma_m: Input should be greater than 0, not -1.0"
+    assert told("depth.sigma_m = -1.0") == "depth.sigma_m: expected a number greater than 0, not -1.0"
     assert told("floor.z_m = 1") == "floor.sigma_m: is missing"
     assert "not 'aaaa" in told(f"gravity_m_s2 = '{'a' * 500}'")
     assert len(told(f"gravity_m_s2 = '{'a' * 500}'")) < 200

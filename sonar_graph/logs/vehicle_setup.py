@@ -32,6 +32,8 @@ BODY_FRAME = "base_link"
 FrameTree = dict[str, tuple[str, gtsam.Pose3]]
 """Parent and ``parent_T_frame`` of each frame."""
 Values = Mapping[str, Any]
+OPTIONAL = {name for name, value in Calibration().model_dump().items() if value is None}
+"""Fields of a calibration that may be absent."""
 MOUNTING_FIELDS = {
     "imu": "mounting",
     "dvl": "mounting",
@@ -113,7 +115,11 @@ class PartialCalibration:
         except ValidationError as error:
             absent = [fault["type"] == "missing" and isinstance(fault["loc"][-1], str) for fault in error.errors()]
             if not all(absent):
-                raise CalibrationError(f"{source}: {faults_in(error, Calibration)}") from error
+                unused = [role for role in ("depth", "heading", "positions") if values.get(role) is False]
+                advice = "".join(
+                    f"; to leave {r} unused: use = false under [{r}] in the log configuration" for r in unused
+                )
+                raise CalibrationError(f"{source}: {faults_in(error, Calibration)}{advice}") from error
         return cls(values, source)
 
     @classmethod
@@ -210,13 +216,13 @@ def mounted_by(values: Values) -> set[str]:
 
 
 def _over(values: Values, changes: Values) -> dict[str, Any]:
-    """Values with changes, section by section; ``false`` for what is no flag takes it away."""
+    """Values with changes, section by section; ``false`` takes away what may be absent (`OPTIONAL`)."""
     merged = dict(values)
     for name, change in changes.items():
         old = merged.get(name)
         if isinstance(old, Mapping) and isinstance(change, Mapping):
             merged[name] = _over(old, change)
-        elif change is False and name in merged and not isinstance(old, bool):
+        elif change is False and name in OPTIONAL:
             merged[name] = None
         else:
             merged[name] = change

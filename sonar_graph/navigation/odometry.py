@@ -21,7 +21,7 @@ from types import NoneType
 
 import numpy as np
 
-from sonar_graph.calibration import ROWS_BEFORE, Calibration
+from sonar_graph.calibration import ROWS_BEFORE, Calibration, require_calibration
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Depth, Dvl, Floats, Imu, Ints
 from sonar_graph.motion import Motions, PreintegratedMotion
@@ -68,6 +68,7 @@ class Odometry:
     """
 
     def __init__(self, calibration: Calibration) -> None:
+        require_calibration(calibration, "Odometry(calibration)")
         self.calibration = calibration
         """What it was made with."""
         self._intake = RowIntake(calibration)

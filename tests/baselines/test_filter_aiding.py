@@ -5,13 +5,27 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 from baselines.ekf_slam import EkfSlam
+from baselines.invariant_ekf import InvariantEkf
 from sonar_graph.measurements import Measurements, PositionFixes
+from sonar_graph.states import Refusal
 from sonar_graph.testing.numerical import central_differences
 
-from .runs import T0_NS, aided, begun, circle, circle_calibration, height_and_tilt, in_a_gap, later, run, slam_filters
+from .runs import (
+    T0_NS,
+    aided,
+    begun,
+    circle,
+    circle_calibration,
+    height_and_tilt,
+    in_a_gap,
+    later,
+    run,
+    slam_filters,
+    state_of,
+)  # fmt: skip
 
 
 @slam_filters
@@ -65,3 +79,79 @@ def test_a_late_fix_has_the_motion_backwards_with_its_covariance_and_derivative(
     assert_allclose(back.C, J @ forth.covariance @ J.T, rtol=1e-6, atol=1e-12)
     assert_allclose(back.D, J @ forth.D_bias, atol=1e-6)
     assert np.abs(back.C - forth.covariance).max() > 1e-6
+
+
+GYRO_BIAS = np.array([2e-3, -4e-3, 6e-3])
+
+
+def on_a_circle(kind, *cuts):
+    """A filter on a circle, its rows handed in by these cuts (s), and the rows after them.
+
+    The gyros have a bias that the invariant filter knows; EKF-SLAM, without a place for it, has gyros without.
+    """
+    gyro, doppler = circle(GYRO_BIAS * (kind is InvariantEkf), seconds=60)
+    slam, before_ns = begun(kind, circle_calibration()), T0_NS - 1
+    for end_ns in (later(cut) for cut in cuts):
+        slam.process(Measurements(end_ns, gyro.between(before_ns, end_ns), doppler.between(before_ns, end_ns)))
+        before_ns = end_ns
+        if kind is InvariantEkf:
+            slam._state.bias[:6] = np.tile(GYRO_BIAS, 2)
+    return slam, (gyro.between(before_ns, later(60.0)), doppler.between(before_ns, later(60.0)))
+
+
+def fix_at(second, position_m, sigma_m=0.01):
+    return PositionFixes(np.array([later(second)]), np.reshape(position_m, (1, 3)), sigma_m**2 * np.eye(3)[None])
+
+
+def means_and_covariance(slam):
+    """What the filter expects, as one row, and its covariance."""
+    if isinstance(slam, EkfSlam):
+        return slam.state()[1:]
+    _, state = slam.state()
+    return np.concatenate([state.R.ravel(), state.points.ravel(), state.bias]), state.P
+
+
+@slam_filters
+@pytest.mark.parametrize("late_s", [6.03, 9.93])
+def test_a_late_fix_where_the_filter_said_that_it_was_moves_nothing_but_tells(kind, late_s):
+    """Before the newest epoch, at 9.8 s, and after it; with a gyro bias in the state, where there is one."""
+    slam, _ = on_a_circle(kind, 1.0, late_s, 9.95)
+    assert slam.node_ns == later(9.8)
+    assert_moved_by_a_late_fix(slam, late_s, 9.95, is_used=True)
+
+
+def assert_moved_by_a_late_fix(slam, late_s, now_s, *, is_used):
+    """A fix where the filter said that it was leaves the means, and makes the covariance less where it is used."""
+    said, (mean, P) = slam.trajectory(), means_and_covariance(slam)
+    (then,) = np.flatnonzero(said.stamps_ns == later(late_s))
+    slam.process(Measurements(later(now_s), positions=fix_at(late_s, said.positions[then])))
+    mean_after, P_after = means_and_covariance(slam)
+    assert [row.reason for row in slam.refused_rows()] == [Refusal.LATE] * (not is_used)
+    assert_allclose(mean_after, mean, atol=1e-4 if is_used else 0.0)
+    assert (np.trace(P_after) < 0.9 * np.trace(P)) == is_used
+
+
+@slam_filters
+def test_a_late_fix_counts_the_same_alone_as_with_rows_of_later(kind):
+    """After the newest epoch, where the velocity to come would tell another way."""
+    states = []
+    for is_alone in (True, False):
+        slam, (gyro, doppler) = on_a_circle(kind, 1.0, 9.95)
+        doppler = replace(doppler, velocity=doppler.velocity * 1.1)
+        late, end_ns = fix_at(9.93, (1.0, 2.0, -3.0)), later(12.0)
+        if is_alone:
+            slam.process(Measurements(later(9.95), positions=late))
+        rows = gyro.between(T0_NS, end_ns), doppler.between(T0_NS, end_ns)
+        slam.process(Measurements(end_ns, *rows, positions=None if is_alone else late))
+        states.append(state_of(slam))
+    for one, other in zip(*states, strict=True):
+        assert_array_equal(one, other)
+
+
+@slam_filters
+@pytest.mark.parametrize(("age_s", "is_used"), [(19.0, True), (21.0, False), (35.0, False)])
+def test_a_fix_counts_up_to_twenty_seconds_late_however_long_the_run(kind, age_s, is_used):
+    """As far back as rows are kept, however many of an older time still are; an older one is refused by name."""
+    now_s = 58.0
+    slam, _ = on_a_circle(kind, *np.arange(1.0, now_s + 0.5))
+    assert_moved_by_a_late_fix(slam, now_s - age_s, now_s, is_used=is_used)

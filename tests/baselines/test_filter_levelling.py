@@ -162,3 +162,18 @@ def test_detections_in_a_gap_count_less_and_less_and_those_after_it_in_full(kind
     assert variances[2] / variances[1] == pytest.approx(3.0, rel=0.01)
     assert variances[4] < 1e-3 * variances[1]
     assert variances[5] == pytest.approx(variances[1], rel=0.01), "the next gap counts anew"
+
+
+@slam_filters
+def test_landmarks_of_one_frame_in_a_gap_share_its_error(kind):
+    """Each of n counts with ``n (n + 1)`` times the motion's covariance, however they are ordered."""
+    known, azimuths = later(1.5, 1.5, 1.5), (0.0, 0.5, -0.5)
+    variances = []
+    for n in (1, 3):
+        stamps_ns = np.concatenate([known, later(9.0, 9.0, 9.0)[:n]])
+        rows = seen(stamps_ns, 3.0, [*azimuths, *azimuths[:n]])
+        rows = replace(rows, candidate_ids=np.array([[3], [4], [5], [3], [4], [5]])[: len(rows)])
+        log = run(kind, in_a_gap(detections=rows)).detections()
+        assert log.outcomes == [Outcome.NEW] * 3 + [Outcome.USED] * n
+        variances.append(log.innovation_covs[3, 0, 0])
+    assert variances[1] / variances[0] == pytest.approx(3 * 4 / 2, rel=0.01)

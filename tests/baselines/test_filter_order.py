@@ -17,7 +17,21 @@ from sonar_graph.sequence import Sequence
 from sonar_graph.slam.landmarks import ACCEPTED
 from sonar_graph.states import CausalEstimates, Estimate, Outcome, Refusal
 
-from .runs import T0_NS, aided, begun, depths, dvl, imu, in_a_gap, later, run, seen, slam_filters, state_of
+from .runs import (
+    T0_NS,
+    aided,
+    begun,
+    depths,
+    dvl,
+    every_filter,
+    imu,
+    in_a_gap,
+    later,
+    run,
+    seen,
+    slam_filters,
+    state_of,
+)
 
 
 def test_causal_estimates_keep_the_later_answer_and_time_never_runs_back():
@@ -202,3 +216,20 @@ def test_an_innovation_that_a_source_of_motion_lets_be_impossible_is_an_error_wi
     monkeypatch.setattr(Odometry, "used_depths", lambda _, depth: depth)
     with pytest.raises(EstimatorError, match=rf"{kind.name}: between \d+ and \d+ ns .* variances above zero"):
         run(kind, in_a_gap(depths(np.array([later(1.0)]), 1.0, -1e6)))
+
+
+@every_filter
+def test_settings_and_measurements_of_another_type_are_refused_by_name(kind):
+    calibration, name = Calibration(), getattr(kind, "name", "dead-reckoning")
+    settings = kind.Params.__name__
+    for params, given in (({"gravity_interval_s": 2.0}, "dict"), (kind.Params, f"the class {settings}")):
+        said = rf"{name}: params: expected {settings} or None, not {given}; of a dict: {settings}\(\*\*params\)"
+        with pytest.raises(EstimatorError, match=said):
+            kind(calibration, Odometry(calibration), params)
+    for given, said in ((None, "NoneType; of blocks"), (dvl(1), r"Dvl; of blocks: Measurements\(end_ns, dvl=")):
+        with pytest.raises(MeasurementError, match=rf"{name}: process\(measurements\): expected .*, not {said}"):
+            begun(kind, calibration).process(given)
+    for given in ({}, None, Odometry(calibration)):
+        said = rf"{kind.__name__}\(calibration, .*expected a Calibration, not {type(given).__name__}; of a dict"
+        with pytest.raises(TypeError, match=said):
+            kind(given, Odometry(calibration))

@@ -50,7 +50,7 @@ def second(entry: str) -> str:
     ("text", "at", "words"),
     [
         (head("nmae = 1\n"), "nmae", "nmae: there is no such field; did you mean name?"),
-        (HEADER.replace('"short"', "3") + BASIN + DEAD_RECKONING, "name", "name: Input should be a valid string"),
+        (HEADER.replace('"short"', "3") + BASIN + DEAD_RECKONING, "name", "name: expected a text"),
         (end("grdi = {}\n"), "grdi", "did you mean grid?"),
         (log("seeds = -1.5\n"), "seeds", "seeds"),
         (log('log = "x.mcap"\n'), "[[logs]]", "exactly one of log, dataset and generator"),
@@ -78,7 +78,7 @@ def second(entry: str) -> str:
         (log("seeds = [-1]\n"), "seeds", "logs.0.seeds: expected the number of seeds"),
         (log("seeds = [9223372036854775808]\n"), "seeds", "to 9223372036854775807"),
         (log("seeds = 1000001\n"), "seeds", "up to 1000000"),
-        (log("seeds = true\n"), "seeds", "not True"),
+        (log("seeds = true\n"), "seeds", "not true"),
         (log('seeds = "2"\n'), "seeds", "not '2'"),
         (basin("120", "inf"), "options", "options.duration_s"),
         (log("grid = { wrong_id_rate = [0.1, 0.1] }\n"), "grid", "has 0.1 more than once"),

@@ -76,7 +76,7 @@ def test_folder_gives_the_designs_of_all_its_files_and_a_missing_one_is_named(tm
         ("", "no landmark designs"),
         ("[[landmark]\n", "is not TOML"),
         (HALF + HALF, "half and half both have the id 7"),
-        (HALF.replace("size_m = 0.4", "size_m = -1"), "landmark 'half': size_m: Input should be greater than or"),
+        (HALF.replace("size_m = 0.4", "size_m = -1"), "landmark 'half': size_m: expected a number greater than or"),
         (HALF.replace("polygon_m", "plygon_m"), "'half': shape 1.plygon_m: there is no .*did you mean polygon_m"),
         (HALF.replace("size_m", "sizes_m"), "sizes_m: there is no such field; did you mean size_m"),
         (HALF.replace('name = "half"', ""), r"\[\[landmark\]\] number 1: name: is missing"),

@@ -19,7 +19,7 @@ from sonar_graph.evaluation.results import MOST_ROWS_NAMED, RunResult, gathered
 from sonar_graph.evaluation.run import run_estimator
 from sonar_graph.evaluation.storage import read_comparison, write_comparison
 from sonar_graph.logs.writing import write_log
-from sonar_graph.measurements import Dvl, Measurements
+from sonar_graph.measurements import Dvl, Heading, Measurements, PositionFixes
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
@@ -319,3 +319,19 @@ def test_a_landmark_that_isam2_could_not_place_reaches_the_comparison(monkeypatc
     (line, *_) = run_estimator(sequence, "isam2").withheld
     assert line.startswith("landmark ")
     assert line.endswith("; withheld")
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+@pytest.mark.parametrize("unit", [1, 1000], ids=["s", "ms"])
+def test_headings_and_fixes_that_are_not_stamped_in_nanoseconds_are_named_and_change_nothing(straight, name, unit):
+    """Also in a log whose clock begins at zero, where they lie within the run."""
+    stamps_ns = straight.imu.stamps_ns[0] + unit * np.arange(20)
+    slow_ns = straight.imu.stamps_ns[0] + NS // 10 * np.arange(20)
+    blocks = {
+        "heading": lambda t: Heading(t, np.zeros(20), np.full(20, np.nan)),
+        "positions": lambda t: PositionFixes(t, np.zeros((20, 3)), np.full((20, 3, 3), np.nan)),
+    }
+    for sensor, block in blocks.items():
+        run = run_estimator(replace(straight, **{sensor: block(stamps_ns)}), name)
+        assert Counter((row.sensor, row.reason) for row in run.refused) == {(sensor, Refusal.RATE): 20}
+        assert not run_estimator(replace(straight, **{sensor: block(slow_ns)}), name).refused

@@ -31,7 +31,7 @@ MISTAKES: dict[str, tuple[str | None, str]] = {
     "unknown axes": ('[imu]\nrotation = "ned"', r"\[imu\] rotation.*'flu' or 'frd'.*not 'ned'"),
     "two angles": ("[imu]\nrotation = [1, 2]", r"\[imu\] rotation"),
     "meaning of a shipped type": (DVL + 'covariance = {meaning = "sigma"}',
-        r"\[dvl\] covariance\.meaning: Input should be 'variance' or 'standard deviation', not 'sigma'"),
+        r"\[dvl\] covariance\.meaning: expected 'variance' or 'standard deviation', not 'sigma'"),
     "no velocity": ('[dvl]\ntype = "my_msgs/msg/Dvl"', r"\[dvl\] .*give velocity = \[x, y, z\] fields"),
     "pressure and height": ('[depth]\ntype = "sensor_msgs/msg/FluidPressure"\nheight = "data"',
         r"\[depth\] .*give either"),
