@@ -84,12 +84,15 @@ def test_a_late_fix_has_the_motion_backwards_with_its_covariance_and_derivative(
 GYRO_BIAS = np.array([2e-3, -4e-3, 6e-3])
 
 
-def on_a_circle(kind, *cuts):
-    """A filter on a circle, its rows handed in by these cuts (s), and the rows after them.
+def on_a_winding_way(kind, *cuts):
+    """A filter on a winding way, its rows handed in by these cuts (s), and the rows after them.
 
     The gyros have a bias that the invariant filter knows; EKF-SLAM, without a place for it, has gyros without.
     """
-    gyro, doppler = circle(GYRO_BIAS * (kind is InvariantEkf), seconds=60)
+    gyro, doppler = circle(seconds=60)
+    wave = np.cos(0.1 * (gyro.stamps_ns[:, None] - T0_NS) * 1e-9)
+    gyro = replace(gyro, angular_velocity=gyro.angular_velocity * wave + GYRO_BIAS * (kind is InvariantEkf))
+    doppler = replace(doppler, velocity=doppler.velocity * (1.0 + 0.3 * wave[::10]))
     slam, before_ns = begun(kind, circle_calibration()), T0_NS - 1
     for end_ns in (later(cut) for cut in cuts):
         slam.process(Measurements(end_ns, gyro.between(before_ns, end_ns), doppler.between(before_ns, end_ns)))
@@ -115,7 +118,7 @@ def means_and_covariance(slam):
 @pytest.mark.parametrize("late_s", [6.03, 9.93])
 def test_a_late_fix_where_the_filter_said_that_it_was_moves_nothing_but_tells(kind, late_s):
     """Before the newest epoch, at 9.8 s, and after it; with a gyro bias in the state, where there is one."""
-    slam, _ = on_a_circle(kind, 1.0, late_s, 9.95)
+    slam, _ = on_a_winding_way(kind, 1.0, late_s, 9.95)
     assert slam.node_ns == later(9.8)
     assert_moved_by_a_late_fix(slam, late_s, 9.95, is_used=True)
 
@@ -136,7 +139,7 @@ def test_a_late_fix_counts_the_same_alone_as_with_rows_of_later(kind):
     """After the newest epoch, where the velocity to come would tell another way."""
     states = []
     for is_alone in (True, False):
-        slam, (gyro, doppler) = on_a_circle(kind, 1.0, 9.95)
+        slam, (gyro, doppler) = on_a_winding_way(kind, 1.0, 9.95)
         doppler = replace(doppler, velocity=doppler.velocity * 1.1)
         late, end_ns = fix_at(9.93, (1.0, 2.0, -3.0)), later(12.0)
         if is_alone:
@@ -153,5 +156,5 @@ def test_a_late_fix_counts_the_same_alone_as_with_rows_of_later(kind):
 def test_a_fix_counts_up_to_twenty_seconds_late_however_long_the_run(kind, age_s, is_used):
     """As far back as rows are kept, however many of an older time still are; an older one is refused by name."""
     now_s = 58.0
-    slam, _ = on_a_circle(kind, *np.arange(1.0, now_s + 0.5))
+    slam, _ = on_a_winding_way(kind, *np.arange(1.0, now_s + 0.5))
     assert_moved_by_a_late_fix(slam, now_s - age_s, now_s, is_used=is_used)
