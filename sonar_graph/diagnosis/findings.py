@@ -13,7 +13,7 @@ import numpy as np
 
 from sonar_graph.calibration import Calibration, ImuCalibration, Start
 from sonar_graph.errors import AlignmentError
-from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu
+from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Heading, Imu
 from sonar_graph.navigation.alignment import (
     LONGEST_S,
     DvlMatch,
@@ -163,6 +163,7 @@ def numbers(values: Iterable[float], digits: int) -> str:
     return f"[{', '.join(f'{value:.{digits}f}' for value in values)}]"
 
 
+FEWEST_HEADINGS = 5
 RESTS_S = (10, 20, 40, 80, 160)
 """Tried lengths of a rest at the start; the longest that holds counts."""
 LEAST_TILT_RAD = np.radians(0.25)
@@ -199,6 +200,8 @@ class StartTilt:
 
 def find_start_tilt(sequence: Sequence) -> StartTilt:
     """Alignment at rest if the vehicle rests at the start, else in motion, of a log with the other faults corrected."""
+    if np.isnan(sequence.imu.specific_force).all():
+        return StartTilt(None, "no accelerometers")
     found = StartTilt(None, "no rows")
     for rest_s in RESTS_S:
         imu, dvl = _beginning(sequence, rest_s)
@@ -211,6 +214,8 @@ def find_start_tilt(sequence: Sequence) -> StartTilt:
             break
         lasted_s = (imu.stamps_ns[-1] - imu.stamps_ns[0]) / NS_PER_S
         found = StartTilt(tilt, f"from {lasted_s:.0f} s of rest", is_rest=True)
+        if (turned := turn_by_heading(sequence.heading, imu, tilt)) is not None:
+            found = StartTilt(turned, f"{found.said}, less the turn of the heading", is_rest=True)
     if found.tilt is not None:
         return found
     imu, dvl = _beginning(sequence, LONGEST_S)
@@ -224,6 +229,31 @@ def find_start_tilt(sequence: Sequence) -> StartTilt:
     except np.linalg.LinAlgError:
         return StartTilt(None, f"at rest: {found.said}; in motion: the calibration's noise is zero")
     return StartTilt(tilt, f"from {(imu.stamps_ns[-1] - imu.stamps_ns[0]) / NS_PER_S:.0f} s in motion")
+
+
+def turn_by_heading(heading: Heading | None, imu: Imu, tilt: InitialTilt) -> InitialTilt | None:
+    """Alignment at rest whose gyro bias is without a turn that the heading confirms; None where it confirms none.
+
+    A vehicle that turns slowly and steadily looks like one at rest whose gyros have a bias. The heading's rate, by
+    least squares over the rest, counts where it is most of that of the gyros about the vertical, and four of its sigmas
+    (as if all of its scatter were one slow wave).
+    """
+    rows = None if heading is None else heading.between(int(imu.stamps_ns[0]) - 1, int(imu.stamps_ns[-1]))
+    if rows is None or len(rows) < FEWEST_HEADINGS:
+        return None
+    t = (rows.stamps_ns - rows.stamps_ns.mean()) * 1e-9
+    yaw_rad = np.unwrap(rows.yaw_rad) - np.unwrap(rows.yaw_rad).mean()
+    rate = float(t @ yaw_rad / (t @ t))
+    sigma = 2.0 * float(np.std(yaw_rad - rate * t)) / float(np.ptp(t))
+    roll, pitch = tilt.roll_rad, tilt.pitch_rad
+    up = np.array([-np.sin(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch)])
+    by_gyros = float(up @ tilt.gyro_bias)
+    rate = float(np.copysign(rate, by_gyros))  # also of a compass that runs mirrored
+    if abs(rate) < 4.0 * sigma or abs(rate - by_gyros) > 0.5 * abs(by_gyros):
+        return None
+    covariance = tilt.covariance.copy()
+    covariance[2:, 2:] += sigma**2 * np.outer(up, up)
+    return replace(tilt, gyro_bias=tilt.gyro_bias - rate * up, covariance=covariance)
 
 
 def tilt_findings(found: StartTilt, start: Start, yaw_rad: float) -> list[Finding]:

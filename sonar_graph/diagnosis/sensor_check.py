@@ -15,6 +15,7 @@ from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import DvlCalibration, Start
+from sonar_graph.diagnosis.aiding_check import heading_findings, position_findings
 from sonar_graph.diagnosis.findings import (
     IN_CALIBRATION,
     IN_LOG_CONFIG,
@@ -32,7 +33,7 @@ from sonar_graph.diagnosis.findings import (
     with_fitted,
 )
 from sonar_graph.logs.adapters import LogConfig
-from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu, PositionFixes
+from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu
 from sonar_graph.navigation.alignment import (
     DvlMatch,
     Estimate1D,
@@ -178,9 +179,6 @@ LEAST_HEADING_RAD = np.radians(1.0)
 LARGEST_DENSITY_RATIO = 1.5
 """Ratio to the calibration's density, either way, from which on a line is advised."""
 LARGEST_RESTING_M_S = 0.1
-WINDOW_NS = 10 * NS_PER_S
-FEWEST_WINDOWS = 6
-LARGEST_HEADING_SIGMA_RAD = 0.25
 FROM_DRIVE = "from the turns of the drive"
 
 
@@ -211,8 +209,8 @@ def check_sensors(sequence: Sequence, config: LogConfig | None = None) -> list[F
     right = corrected_sequence(sequence, match, of_dvl)
     tilt = find_start_tilt(right)
     bias = bias_findings(*surest_bias(match, tilt), sequence.calibration.imu)
-    heading = heading_findings(right, config)
-    return [*of_dvl, *lever, *bias, *heading, *reference_findings(right, config, tilt), *noise_findings(sequence)]
+    aiding = [*heading_findings(right, config), *position_findings(right, config)]
+    return [*of_dvl, *lever, *bias, *aiding, *reference_findings(right, config, tilt), *noise_findings(sequence)]
 
 
 def dvl_findings(found: DvlMatch, sequence: Sequence, config: LogConfig) -> list[Finding]:
@@ -278,42 +276,6 @@ def reference_findings(right: Sequence, config: LogConfig, tilt: StartTilt) -> I
     yield from tilt_findings(tilt, start, heading.rpy_rad[2] if heading and heading.acts else start.rpy_rad[2])
     if heading:
         yield heading.finding(tilt)
-
-
-def heading_findings(right: Sequence, config: LogConfig) -> Iterator[Finding]:
-    """Angle by which the heading is off the world of the position fixes, or of true positions where there are none.
-
-    With Δg the displacement over `WINDOW_NS` as a complex number and Δp that reckoned with heading and velocity,
-    ``Δg = k Δp + e``: by least squares the heading lacks ``arg k``. What is beyond the bias that the calibration allows
-    is another world, north or mounting.
-    """
-    known = right.positions or right.truth
-    if right.heading is None or known is None:
-        return
-    places = known.position_m if isinstance(known, PositionFixes) else known.positions
-    mounting = right.calibration.dvl.mounting.pose().rotation().matrix()
-    x, y, _ = mounting @ right.dvl.velocity.T
-    yaw_rad = np.interp(right.dvl.stamps_ns, right.heading.stamps_ns, np.unwrap(right.heading.yaw_rad))
-    velocity = (x + 1j * y) * np.exp(1j * yaw_rad)
-    path = np.cumsum((velocity[1:] + velocity[:-1]) / 2 * np.diff(right.dvl.stamps_ns) * 1e-9)
-    ends = np.arange(max(known.stamps_ns[0], right.start_ns), min(known.stamps_ns[-1], right.end_ns) + 1, WINDOW_NS)
-    reckoned = np.diff(np.interp(ends, right.dvl.stamps_ns[1:], path))
-    seen = np.diff(np.interp(ends, known.stamps_ns, places[:, 0] + 1j * places[:, 1]))
-    moved = float(np.vdot(reckoned, reckoned).real)
-    angle = Estimate1D(np.nan, np.inf, "too little motion beside positions")
-    if len(seen) >= FEWEST_WINDOWS and moved > 0:
-        k = np.vdot(reckoned, seen) / moved
-        scatter = float(np.mean(np.abs(seen - k * reckoned) ** 2)) / 2
-        found = Estimate1D(float(np.angle(k)), float(np.sqrt(scatter / moved) / max(abs(k), 1e-9)))
-        angle = found.limited(LARGEST_HEADING_SIGMA_RAD, "too little motion beside positions")
-    allowed = right.calibration.heading.bias_sigma_rad
-    acts = matters(replace(angle, sigma=float(np.hypot(angle.sigma, allowed))), 0.0)
-    advice = f"the calibration's bias sigma of {allowed:.2g} rad allows it, {NO_NEED}"
-    if acts:
-        offset = float(config.table("heading").get("yaw_offset_rad", 0.0)) + angle.value
-        line = f"`yaw_offset_rad = {offset:.3f}` under [heading] {IN_LOG_CONFIG}"
-        advice = f"its world, north or mounting is another: {line}"
-    yield Finding("heading: turn towards the positions", in_degrees(angle), "°", advice, acts)
 
 
 def noise_findings(sequence: Sequence) -> Iterator[Finding]:

@@ -12,7 +12,7 @@ from sonar_graph.calibration import Calibration
 from sonar_graph.diagnosis import sensor_check
 from sonar_graph.diagnosis.findings import Finding, StartTilt, find_start_tilt
 from sonar_graph.logs.adapters.log_config import LogConfig
-from sonar_graph.measurements import Dvl, Floats, Heading, Imu, PositionFixes
+from sonar_graph.measurements import Dvl, Floats, Imu
 from sonar_graph.navigation.alignment import InitialTilt
 from sonar_graph.navigation.alignment.dvl_imu import DvlMatch
 from sonar_graph.navigation.alignment.time_offset import Estimate1D
@@ -310,36 +310,6 @@ def test_what_is_usual_is_not_doubted_and_gravity_is_that_of_the_calibration():
     assert "typically 1 instead" in fault.advice
     (fault,) = units(turn=2.1)
     assert fault.advice.startswith("rates look 57 times too large (up to 2.1 rad/s): degrees a second? ")
-
-
-@pytest.mark.parametrize("places", ["fixes", "true positions", "neither"])
-def test_a_heading_of_another_world_is_told_by_positions_with_the_offset_that_puts_it_right(places: str):
-    """A Doppler log that is turned on the body is no turn of the heading."""
-    truth, off_rad = RIGHT.truth, 0.4
-    rows = slice(0, len(truth), max(1, len(truth) // 1000))
-    yaw_rad = truth.rotations().as_euler("ZYX")[rows, 0]
-    stamps_ns, positions = truth.stamps_ns[rows], truth.positions[rows]
-    fixes = PositionFixes(stamps_ns, positions, np.full((len(positions), 3, 3), np.nan))
-    velocity = Rotation.from_euler("z", -0.7).apply(RIGHT.dvl.velocity)
-    run = with_mounting(replace(RIGHT, dvl=replace(RIGHT.dvl, velocity=velocity)), "dvl", rpy_rad=(0.0, 0.0, 0.7))
-    run = replace(
-        run, truth=truth if places == "true positions" else None, positions=fixes if places == "fixes" else None
-    )
-    for said, before in ((yaw_rad + off_rad, 0.0), (yaw_rad + off_rad, 0.1), (yaw_rad, 0.0)):
-        run = replace(run, heading=Heading(stamps_ns, said, np.full(len(said), np.nan)))
-        config = LogConfig.parse({"heading": {"yaw_offset_rad": before}}, "x")
-        found = list(sensor_check.heading_findings(run, config))
-        if places == "neither":
-            assert not found
-            continue
-        (finding,) = found
-        wrong = said[0] != yaw_rad[0]
-        assert finding.estimate.value == pytest.approx(np.degrees(-off_rad * wrong), abs=2.0)
-        assert finding.acts == wrong
-        if wrong:
-            assert line_of(finding) == pytest.approx({"yaw_offset_rad": before - off_rad}, abs=0.04)
-    still = replace(run, dvl=replace(run.dvl, velocity=0 * velocity))
-    assert not any(f.estimate.is_known for f in sensor_check.heading_findings(still, LogConfig()))
 
 
 def test_slow_rates_in_degrees_are_told_by_gravity():

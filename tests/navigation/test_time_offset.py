@@ -8,7 +8,7 @@ import pytest
 from scipy.linalg import block_diag
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from sonar_graph.navigation.alignment import dvl_imu, reference_offset
+from sonar_graph.navigation.alignment import dvl_imu, reference_offset, time_offset
 from sonar_graph.navigation.alignment.time_offset import (
     Estimate1D,
     NormalEquations,
@@ -215,6 +215,12 @@ def test_the_range_ends_at_two_seconds(offset_s):
     assert found.is_known
     assert found.value == pytest.approx(offset_s, abs=0.01)
     assert "no best offset within ±2 s" in searched(swaying, 1.35 * offset_s).reason
+
+
+def test_an_offset_that_still_moves_after_the_last_step_is_not_known(monkeypatch):
+    assert searched(swaying, 0.25, noise=1e-6).reason == ""
+    monkeypatch.setattr(time_offset, "ROUNDS", 1)
+    assert searched(swaying, 0.25, noise=1e-6).reason.startswith("it does not settle: after 1 steps near +0.25 s")
 
 
 def test_a_motion_that_repeats_is_named_with_two_of_its_places():

@@ -183,6 +183,10 @@ class PositionAdapter(Adapter):
     """Fields of a position on the Earth."""
     position: tuple[str, str, str] | None = None
     """Fields of x, y, z in the world instead, metres."""
+    scale: Scale = 1.0
+    """Turns `position` into metres, and its covariance by the square; 0.001 from millimetres."""
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """World's origin in the scaled coordinates of `position`, such as that of a run in a map grid (UTM)."""
     world: Literal["enu", "ned"] = "enu"
     """"enu" (any world with z up), or "ned"; of `position`."""
     covariance: CovarianceFields | None = None
@@ -216,13 +220,15 @@ class PositionAdapter(Adapter):
             positions, is_fix, has_height = self.geodetic.positions(table, origin)
             faults["without a fix"] = ~is_fix
         else:
-            positions = table.beside(self.position or ()).astype(float)
+            positions = table.beside(self.position or ()).astype(float) * self.scale - self.origin_m
             faults[NOT_FINITE] = not_finite(positions)
         covariances = np.full((len(table), 3, 3), np.nan)
         if self.covariance is not None:
             covariances, faults["with a covariance that says invalid"] = self.covariance.read(table)
         if self.covariance_type is not None:
             covariances = np.where((table.column(self.covariance_type) == 0)[:, None, None], np.nan, covariances)
+        if self.position is not None:
+            covariances = covariances * self.scale**2
         if self.position is not None and self.world == "ned":
             positions, covariances = positions @ ENU_R_NED.T, ENU_R_NED @ covariances @ ENU_R_NED.T
         flat = np.where(np.isnan(covariances), np.diag(np.square(sigma_m)), covariances)
@@ -237,7 +243,8 @@ class PositionAdapter(Adapter):
         if self.covariance is not None:
             yield from self.covariance.warnings(table)
         if self.position is not None:
-            is_far = (np.abs(table.beside(self.position).astype(float)) > FARTHEST_FIX_M).any(axis=1)
+            positions = table.beside(self.position).astype(float) * self.scale - self.origin_m
+            is_far = (np.abs(positions) > FARTHEST_FIX_M).any(axis=1)
             if is_far.any():
                 yield (
                     f"{np.count_nonzero(is_far)} of {len(table)} rows have a position beyond "

@@ -200,6 +200,7 @@ CLEARLY_WORSE = 16.0
 """Least chi-square by which any other minimum must be worse: four sigmas."""
 NEIGHBOURHOOD_S = 0.3
 ROUNDS = 6
+SETTLED_SIGMAS = 0.1
 LineUp = Callable[[float], Sequence[SampleSeries]]
 """The data lined up for an offset in seconds."""
 
@@ -266,7 +267,8 @@ def search_offset(line_up: LineUp, prior_sigmas: Floats) -> OffsetFit:
     # The ratios of the grid, up to half a step off the best offset, take motion that is not lined up for noise.
     offset_s = _converge(line_up, prior_sigmas, ratios, offset_s, limits).offset_s
     ratios = fit(_with_offset(line_up, offset_s, prior_sigmas, ratios), sigmas).ratios
-    return replace(_converge(line_up, prior_sigmas, ratios, offset_s, limits), reason=reason)
+    found = _converge(line_up, prior_sigmas, ratios, offset_s, limits)
+    return replace(found, reason=reason or found.reason)
 
 
 def reason_not_unique(grid: Floats, chi2: Floats, best: int) -> str:
@@ -284,7 +286,7 @@ def reason_not_unique(grid: Floats, chi2: Floats, best: int) -> str:
 def _converge(
     line_up: LineUp, prior_sigmas: Floats, ratios: Floats, offset_s: float, limits: tuple[float, float]
 ) -> OffsetFit:
-    """Gauss-Newton steps of the offset within limits."""
+    """Gauss-Newton steps of the offset within limits; one that still moves by a tenth of its sigma is not known."""
     sigmas = np.concatenate([[PRIOR_OFFSET_S], prior_sigmas])
     for _ in range(ROUNDS):
         found = fit(_with_offset(line_up, offset_s, prior_sigmas, ratios), sigmas, ratios)
@@ -292,7 +294,10 @@ def _converge(
         offset_s = float(np.clip(offset_s + step, *limits))
         if abs(step) < 1e-5:
             break
-    return OffsetFit(found, offset_s, "")
+    sigma_s = float(np.sqrt(found.covariance[0, 0]))
+    is_settled = abs(float(found.parameters[0])) < max(SETTLED_SIGMAS * sigma_s, 1e-5)
+    told = f"it does not settle: after {ROUNDS} steps near {offset_s:+.2f} s the next is {step:+.2g} s"
+    return OffsetFit(found, offset_s, "" if is_settled else told)
 
 
 def _with_offset(line_up: LineUp, offset_s: float, prior_sigmas: Floats, ratios: Floats) -> list[SampleSeries]:

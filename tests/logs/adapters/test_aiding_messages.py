@@ -102,6 +102,9 @@ CASES: dict[str, Case] = {
         "", {"positions.position_m": [[1, 2, -3]]}, {}),
     "acoustic fixes in north-east-down": (
         [points((1, 2, 3))], '[positions]\nworld = "ned"', {"positions.position_m": [[2, 1, -3]]}, {}),
+    "fixes in millimetres of a map grid in north-east-down": (
+        [points((4.67e9, 5e8, 3000.0))], '[positions]\nworld = "ned"\nscale = 1e-3\norigin_m = [4.67e6, 499990.0, 1.0]',
+        {"positions.position_m": [[10, 0, -2]]}, {}),
     "true positions of a total station": (
         [points((1, 2, 3), (1, 2, 4), topic="/ground_truth/point")], '[truth]\nworld = "ned"',
         {"truth.positions": [[2, 1, -3], [2, 1, -4]], "truth.quaternions_xyzw": np.full((2, 4), NAN)}, {}),

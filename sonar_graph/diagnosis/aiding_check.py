@@ -1,0 +1,153 @@
+"""Check of headings and position fixes against gyros and Doppler log.
+
+Over windows of `WINDOW_NS` the heading turns by ``y = k x + b T + e`` where the gyros turn by x about the vertical, of
+bias b: k is 1, and -1 where yaw is counted clockwise. With Δp the displacement by Doppler log and heading as a complex
+number and Δg that of the fixes, ``Δg = c Δp + e``: the heading lacks ``arg c``, and ``|c|`` is the unit of the fixes.
+docs/theory/sensor_check.md.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from sonar_graph.diagnosis.findings import (
+    IN_LOG_CONFIG,
+    INTERVAL_SIGMAS,
+    NO_NEED,
+    Finding,
+    in_degrees,
+    matters,
+    numbers,
+)
+from sonar_graph.logs.adapters import LogConfig
+from sonar_graph.measurements import NS_PER_S, Floats, Imu, Ints, PositionFixes
+from sonar_graph.navigation.alignment import Estimate1D
+from sonar_graph.sequence import Sequence
+
+WINDOW_NS = 10 * NS_PER_S
+FEWEST_WINDOWS = 6
+LARGEST_HEADING_SIGMA_RAD = 0.25
+LARGEST_TURN_SIGMA = 0.25
+"""Of k, so that 1 and -1 are eight sigmas apart."""
+UNITS_M = {"mm": 1e-3, "cm": 1e-2, "km": 1e3, "degrees": 1.1e5}
+LARGEST_RATIO = 10.0
+"""Of displacements by fixes over those by the Doppler log, either way; no noise within the calibration's makes it."""
+FARTHEST_ORIGIN_M = 1e5
+"""No vehicle of a run goes so far; coordinates of a map grid begin beyond."""
+
+
+def turned_about_up(imu: Imu, body_R_imu: Floats, at_ns: Ints) -> Floats:
+    """Turn by the gyros about the vertical since the first row, shape (n,), rad; level without accelerometers."""
+    up = np.array([0.0, 0.0, 1.0])
+    force = imu.specific_force[np.isfinite(imu.specific_force).all(axis=1)]
+    if len(force):
+        up = body_R_imu @ np.median(force, axis=0)
+    rate = imu.angular_velocity @ body_R_imu.T @ (up / np.linalg.norm(up))
+    steps = (rate[1:] + rate[:-1]) / 2 * np.diff(imu.stamps_ns) * 1e-9
+    return np.interp(at_ns, imu.stamps_ns, np.concatenate([[0.0], np.cumsum(steps)]))
+
+
+def heading_findings(right: Sequence, config: LogConfig) -> Iterator[Finding]:
+    """Sense in which the heading turns, by the gyros; then the angle by which it is off the world of the positions."""
+    if right.heading is None:
+        return
+    ends = np.arange(
+        max(right.start_ns, right.heading.stamps_ns[0]), min(right.end_ns, right.heading.stamps_ns[-1]) + 1, WINDOW_NS
+    )
+    body_R_imu = right.calibration.imu.mounting.pose().rotation().matrix()
+    x = np.diff(turned_about_up(right.imu, body_R_imu, ends))
+    y = np.diff(np.interp(ends, right.heading.stamps_ns, np.unwrap(right.heading.yaw_rad)))
+    sense = Estimate1D(np.nan, np.inf, "too little turning")
+    if len(x) >= FEWEST_WINDOWS and np.ptp(x) > 0:
+        x, y = x - float(x.mean()), y - float(y.mean())
+        k = float(x @ y / (x @ x))
+        scatter_rad2 = float(np.sum((y - k * x) ** 2)) / (len(x) - 2)
+        sense = Estimate1D(k, float(np.sqrt(scatter_rad2 / (x @ x)))).limited(LARGEST_TURN_SIGMA, "too little turning")
+    if sense.is_known and matters(sense, 0.0) and sense.value < 0:
+        world = "enu" if config.table("heading").get("world") == "ned" else "ned"
+        advice = f'it turns against the gyros, clockwise: `world = "{world}"` under [heading] {IN_LOG_CONFIG}'
+        yield Finding("heading: turn over that of the gyros", sense, "", advice, acts=True)
+        return
+    is_stuck = sense.is_known and sense.value + INTERVAL_SIGMAS * sense.sigma < 0.5
+    advice = (
+        "it hardly turns where the gyros do: stuck, or not of the body; `use = false` under [heading] " + IN_LOG_CONFIG
+    )
+    yield Finding("heading: turn over that of the gyros", sense, "", advice if is_stuck else NO_NEED, is_stuck)
+    known = right.positions or right.truth
+    if known is None:
+        return
+    places = known.position_m if isinstance(known, PositionFixes) else known.positions
+    yaw_rad = np.interp(right.dvl.stamps_ns, right.heading.stamps_ns, np.unwrap(right.heading.yaw_rad))
+    seen, reckoned = displacements(right, known.stamps_ns, places, yaw_rad)
+    moved = float(np.vdot(reckoned, reckoned).real)
+    angle = Estimate1D(np.nan, np.inf, "too little motion beside positions")
+    if len(seen) >= FEWEST_WINDOWS and moved > 0:
+        c = np.vdot(reckoned, seen) / moved
+        scatter_m2 = float(np.mean(np.abs(seen - c * reckoned) ** 2)) / 2
+        found = Estimate1D(float(np.angle(c)), float(np.sqrt(scatter_m2 / moved) / max(abs(c), 1e-9)))
+        angle = found.limited(LARGEST_HEADING_SIGMA_RAD, "too little motion beside positions")
+    allowed = right.calibration.heading.bias_sigma_rad
+    acts = matters(replace(angle, sigma=float(np.hypot(angle.sigma, allowed))), 0.0)
+    advice = f"the calibration's bias sigma of {allowed:.2g} rad allows it, {NO_NEED}"
+    if acts:
+        offset = float(config.table("heading").get("yaw_offset_rad", 0.0)) + angle.value
+        line = f"`yaw_offset_rad = {offset:.3f}` under [heading] {IN_LOG_CONFIG}"
+        advice = f"its world, north or mounting is another: {line}"
+    yield Finding("heading: turn towards the positions", in_degrees(angle), "°", advice, acts)
+
+
+def displacements(right: Sequence, stamps_ns: Ints, places: Floats, yaw_rad: Floats) -> tuple[Floats, Floats]:
+    """Level displacements over windows as complex numbers: of places, shape (n, 3), and by the Doppler log.
+
+    ``yaw_rad``: of the body at the rows of the Doppler log.
+    """
+    x, y, _ = right.calibration.dvl.mounting.pose().rotation().matrix() @ right.dvl.velocity.T
+    velocity = (x + 1j * y) * np.exp(1j * yaw_rad)
+    path = np.cumsum((velocity[1:] + velocity[:-1]) / 2 * np.diff(right.dvl.stamps_ns) * 1e-9)
+    ends = np.arange(max(stamps_ns[0], right.start_ns), min(stamps_ns[-1], right.end_ns) + 1, WINDOW_NS)
+    reckoned = np.diff(np.interp(ends, right.dvl.stamps_ns[1:], path))
+    return np.diff(np.interp(ends, stamps_ns, places[:, 0] + 1j * places[:, 1])), reckoned
+
+
+def position_findings(right: Sequence, config: LogConfig) -> Iterator[Finding]:
+    """Unit of the position fixes, and their distance from the start or, where none is stated, from the origin."""
+    fixes, calibration = right.positions, right.calibration
+    if fixes is None:
+        return
+    table, unknown = config.table("positions"), Estimate1D(np.nan, np.inf, "too few fixes beside the Doppler log")
+    body_R_imu = calibration.imu.mounting.pose().rotation().matrix()
+    yaw_rad = turned_about_up(right.imu, body_R_imu, right.dvl.stamps_ns)
+    seen, reckoned = displacements(right, fixes.stamps_ns, fixes.position_m, yaw_rad)
+    if len(seen) < FEWEST_WINDOWS:
+        yield Finding("position fixes: unit", unknown, "", "")
+        return
+    noise_m = float(np.hypot(*calibration.positions.sigma_m[:2]))
+    seen_m, reckoned_m = float(np.median(np.abs(seen))), float(np.median(np.abs(reckoned)))
+    if seen_m > LARGEST_RATIO * max(reckoned_m, noise_m) or reckoned_m > LARGEST_RATIO**2 * seen_m > 0:
+        unit = min(UNITS_M, key=lambda unit: abs(np.log(seen_m / max(reckoned_m, 1e-9) * UNITS_M[unit])))
+        line = f"`scale = {float(table.get('scale', 1.0)) * UNITS_M[unit]:.4g}`"
+        line = "`geodetic`, with the fields of latitude and longitude," if unit == "degrees" else line
+        advice = (
+            f"in {WINDOW_NS / NS_PER_S:.0f} s they move by {seen_m:.3g} m, the Doppler log by {reckoned_m:.3g} m: "
+            f"{unit}? {line} under [positions] {IN_LOG_CONFIG}"
+        )
+        yield Finding("position fixes: unit", replace(unknown, reason="wrong unit"), "", advice, acts=True)
+        return
+    near = np.median(fixes.position_m[np.argsort(np.abs(fixes.stamps_ns - right.start_ns))[:FEWEST_WINDOWS]], axis=0)
+    start = np.array(calibration.start.position_m)
+    path_m = float(np.sum(np.linalg.norm(right.dvl.velocity[1:], axis=1) * np.diff(right.dvl.stamps_ns)) * 1e-9)
+    allowed_m = 5.0 * float(np.hypot(noise_m, np.hypot(*calibration.start.position_sigma_m[:2]))) + path_m
+    from_start_m, from_origin_m = (float(np.linalg.norm((near - place)[:2])) for place in (start, 0.0 * start))
+    advice, acts = NO_NEED, from_start_m > allowed_m or from_origin_m > FARTHEST_ORIGIN_M
+    distance = Estimate1D(from_start_m, noise_m)
+    if acts:
+        place = "the start" if from_start_m > allowed_m else "the origin of the world"
+        far_m = from_start_m if from_start_m > allowed_m else from_origin_m
+        before = np.array(table.get("origin_m", np.zeros(3)), float)
+        line = f"`origin_m = {numbers(before + np.round(near), 0)}` under [positions] {IN_LOG_CONFIG}"
+        advice = (
+            f"they begin {far_m:.3g} m from {place}, the whole way is {path_m:.3g} m: a map grid (UTM)? "
+            f"{line} moves the origin to the first; or state the start there"
+        )
+    yield Finding("position fixes: distance from the start", distance, "m", advice, acts)

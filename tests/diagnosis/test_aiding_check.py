@@ -1,0 +1,134 @@
+"""Headings and position fixes of a simulated vehicle, spoilt by hand: named with the line that puts them right."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sonar_graph.diagnosis import aiding_check
+from sonar_graph.logs.adapters.log_config import LogConfig
+from sonar_graph.measurements import Heading, PositionFixes
+from sonar_graph.sequence import Sequence
+from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+
+from .test_sensor_check import RIGHT, line_of, with_mounting
+
+NO_CONFIG = LogConfig()
+SLOW = simulate_mission(MissionOptions(seed=5, duration_s=120.0, speed_m_s=0.1))
+
+
+def compass(run: Sequence, yaw_of) -> Sequence:
+    rows = slice(0, len(run.truth), 10)
+    yaw_rad = run.truth.rotations().as_euler("ZYX")[rows, 0]
+    noise = 0.02 * np.random.default_rng(0).standard_normal(len(yaw_rad))
+    return replace(
+        run, heading=Heading(run.truth.stamps_ns[rows], yaw_of(yaw_rad) + noise, np.full(len(yaw_rad), np.nan))
+    )
+
+
+@pytest.mark.parametrize("upside_down", [False, True])
+@pytest.mark.parametrize("gyro_bias", [0.0, 0.01])
+def test_a_compass_that_turns_against_the_gyros_is_named_with_the_other_world(gyro_bias: float, upside_down: bool):
+    """Whatever the bias of the gyros, and however the IMU sits, as gravity tells."""
+    imu = replace(RIGHT.imu, angular_velocity=RIGHT.imu.angular_velocity + np.array([0.0, 0.0, gyro_bias]))
+    if upside_down:
+        turned = [values * [1.0, -1.0, -1.0] for values in (imu.angular_velocity, imu.specific_force)]
+        imu = replace(imu, angular_velocity=turned[0], specific_force=turned[1])
+    run = replace(RIGHT, imu=imu, truth=RIGHT.truth)
+    bearing = compass(run, lambda yaw_rad: np.pi / 2 - yaw_rad)
+    for given, config, world in ((bearing, {}, "ned"), (bearing, {"heading": {"world": "ned"}}, "enu")):
+        (finding,) = aiding_check.heading_findings(given, LogConfig.parse(config, "x"))
+        assert finding.acts
+        assert "turns against the gyros, clockwise" in finding.advice
+        assert line_of(finding) == {"world": world}
+        assert finding.estimate.value == pytest.approx(-1.0, abs=0.1)
+    sense, _ = aiding_check.heading_findings(compass(run, lambda yaw_rad: yaw_rad + 0.01), NO_CONFIG)
+    assert not sense.acts
+    assert sense.estimate.value == pytest.approx(1.0, abs=0.1)
+    stuck, _ = aiding_check.heading_findings(compass(run, lambda yaw_rad: 0 * yaw_rad), NO_CONFIG)
+    assert stuck.acts
+    assert "it hardly turns where the gyros do" in stuck.text()
+
+
+def test_without_turns_nothing_is_said_of_the_sense():
+    straight = replace(RIGHT, imu=replace(RIGHT.imu, angular_velocity=np.zeros_like(RIGHT.imu.angular_velocity)))
+    sense, *_ = aiding_check.heading_findings(compass(straight, lambda yaw_rad: -yaw_rad), NO_CONFIG)
+    assert not sense.acts
+    assert sense.text() == "cannot be told: too little turning"
+
+
+def fixed(run: Sequence, scale=1.0, origin=(0.0, 0.0, 0.0), sigma_m=0.0, every_s=1.0) -> Sequence:
+    """Fixes by satellites of the true position, in another unit and from another origin, with noise."""
+    t = np.arange(run.truth.stamps_ns[0], run.truth.stamps_ns[-1], round(every_s * 1e9))
+    noise = sigma_m * np.random.default_rng(1).standard_normal((len(t), 3))
+    places = scale * (run.truth.at(t).positions + noise) + origin
+    return replace(run, positions=PositionFixes(t, places, np.full((len(t), 3, 3), np.nan)))
+
+
+UNITS = [(1e3, {"scale": 1e-3}), (1e2, {"scale": 1e-2}), (1e-3, {"scale": 1e3}), (1 / 1.1e5, "geodetic"), (1.0, None)]
+
+
+@pytest.mark.parametrize(("scale", "line"), UNITS)
+def test_fixes_in_another_unit_are_named_by_what_the_doppler_log_moves(scale, line):
+    (finding,) = aiding_check.position_findings(fixed(RIGHT, scale), NO_CONFIG)
+    assert finding.acts == (line is not None)
+    if isinstance(line, dict):
+        assert line_of(finding) == pytest.approx(line)
+    elif line:
+        assert "degrees? `geodetic`, with the fields of latitude and longitude" in finding.advice
+
+
+@pytest.mark.parametrize("every_s", [1.0, 15.0])
+def test_noise_of_fixes_of_a_slow_vehicle_is_no_unit_and_no_distance(every_s: float):
+    (finding,) = aiding_check.position_findings(fixed(SLOW, sigma_m=2.5, every_s=every_s), NO_CONFIG)
+    assert not finding.acts, finding.text()
+
+
+def test_fixes_in_a_map_grid_are_named_with_the_origin_that_brings_them_to_the_start():
+    grid = np.array([500_000.0, 4_670_000.0, 0.0])
+    config = LogConfig.parse({"positions": {"origin_m": [1.0, 2.0, 3.0]}}, "x")
+    (finding,) = aiding_check.position_findings(fixed(RIGHT, origin=grid), config)
+    assert finding.acts
+    assert "from the start, the whole way is" in finding.advice
+    assert line_of(finding)["origin_m"] == pytest.approx(grid + RIGHT.truth.positions[0] + [1, 2, 3], abs=2.0)
+    started = RIGHT.calibration.start.model_copy(update={"position_m": tuple(grid)})
+    begun = replace(RIGHT, calibration=RIGHT.calibration.model_copy(update={"start": started}))
+    (finding,) = aiding_check.position_findings(fixed(begun, origin=grid), config)
+    assert "from the origin of the world, the whole way is" in finding.advice
+    few = fixed(RIGHT, every_s=1000.0)
+    assert [one.text() for one in aiding_check.position_findings(few, config)] == [
+        "cannot be told: too few fixes beside the Doppler log"
+    ]
+
+
+@pytest.mark.parametrize("places", ["fixes", "true positions", "neither"])
+def test_a_heading_of_another_world_is_told_by_positions_with_the_offset_that_puts_it_right(places: str):
+    """A Doppler log that is turned on the body is no turn of the heading."""
+    truth, off_rad = RIGHT.truth, 0.4
+    rows = slice(0, len(truth), max(1, len(truth) // 1000))
+    yaw_rad = truth.rotations().as_euler("ZYX")[rows, 0]
+    stamps_ns, positions = truth.stamps_ns[rows], truth.positions[rows]
+    fixes = PositionFixes(stamps_ns, positions, np.full((len(positions), 3, 3), np.nan))
+    velocity = Rotation.from_euler("z", -0.7).apply(RIGHT.dvl.velocity)
+    run = with_mounting(replace(RIGHT, dvl=replace(RIGHT.dvl, velocity=velocity)), "dvl", rpy_rad=(0.0, 0.0, 0.7))
+    run = replace(
+        run, truth=truth if places == "true positions" else None, positions=fixes if places == "fixes" else None
+    )
+    for said, before in ((yaw_rad + off_rad, 0.0), (yaw_rad + off_rad, 0.1), (yaw_rad, 0.0)):
+        run = replace(run, heading=Heading(stamps_ns, said, np.full(len(said), np.nan)))
+        config = LogConfig.parse({"heading": {"yaw_offset_rad": before}}, "x")
+        found = list(aiding_check.heading_findings(run, config))
+        sense, *found = found
+        assert not sense.acts
+        if places == "neither":
+            assert not found
+            continue
+        (finding,) = found
+        wrong = said[0] != yaw_rad[0]
+        assert finding.estimate.value == pytest.approx(np.degrees(-off_rad * wrong), abs=2.0)
+        assert finding.acts == wrong
+        if wrong:
+            assert line_of(finding) == pytest.approx({"yaw_offset_rad": before - off_rad}, abs=0.04)
+    still = replace(run, dvl=replace(run.dvl, velocity=0 * velocity))
+    assert not any(f.estimate.is_known for f in list(aiding_check.heading_findings(still, LogConfig()))[1:])
