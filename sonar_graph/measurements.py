@@ -199,6 +199,9 @@ class Depth(Block):
 class Heading(Block):
     """Yaw of the body in the world, by a compass, an attitude reference or a gyrocompass.
 
+    A sigma of NaN is unknown noise: the row is used, with ``heading.sigma_rad`` of the calibration. The error that all
+    rows share is ``heading.bias_sigma_rad`` in either case. A row that was not measured is left out of the block.
+
     Examples
     --------
     >>> import numpy as np
@@ -221,6 +224,10 @@ class Heading(Block):
 @dataclass(frozen=True, eq=False, repr=False)
 class PositionFixes(Block):
     """Positions of an antenna or acoustic transponder in the world, from satellites or an acoustic array (USBL).
+
+    A covariance with any NaN is unknown as a whole: the row is used, with ``positions.sigma_m`` of the calibration on
+    every axis. A coordinate that was not measured is no NaN, but has a variance of `UNMEASURED_M2`; a row without any is
+    left out of the block.
 
     Examples
     --------

@@ -127,8 +127,8 @@ def report(
 def demo(output: OutputFolder = Path("demo")) -> None:
     """Repeat the 2014 paper's basin experiment in short: simulate sonar images, recognise landmarks, compare, report.
 
-    Three laps in 390 s instead of 2039 s; the log takes about 90 MB. Then twenty runs of the same basin, with and
-    without wrong identities, for what one run cannot tell.
+    Three laps in 390 s instead of 2039 s; the log takes about 90 MB. Then twenty more runs of the same
+    basin with faults and twenty without, from simulated detections, for what one run cannot tell.
     """
     from sonar_graph.evaluation import run_ensembles
     from sonar_graph.report import write_report

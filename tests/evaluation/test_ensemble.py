@@ -58,12 +58,18 @@ def test_a_run_of_an_ensemble_is_the_run_of_a_comparison_and_seeds_make_them_dif
 def test_sentences_tell_means_with_intervals_how_often_the_order_turns_and_both_conditions():
     one, other = ensemble_sentences([made("as hard", good=GOOD, bad=BAD), made("as easy", good=GOOD, bad=GOOD)])
     wins = int((np.array(GOOD) < BAD).sum())
-    assert one.startswith("20 runs as hard: mean causal position error")
+    assert one.startswith(
+        "20 runs as hard: mean position error (causal: told at once, from what was measured until then;"
+    )
     assert one.index("good 0.11") < one.index("bad 0.1")
     assert f"good has the smaller error in {wins} of them, bad in {20 - wins}: one run could have said either" in one
-    assert other.startswith("Under other conditions it may be otherwise: 20 runs as easy")
+    assert other.startswith("Under other conditions it may be otherwise: 20 runs as easy: mean causal pos")
     (sure,) = ensemble_sentences([made(good=GOOD, bad=[2 * error for error in GOOD])])
     assert "either" not in sure
+    assert sure.endswith("good has the smaller error in every one of them.")
+    for filter_, said in ((BAD, True), ([0.5 * error for error in GOOD], False)):
+        (odd,) = ensemble_sentences([made(**{"dead-reckoning": GOOD, "ekf-slam": filter_})])
+        assert ("ekf-slam is worse than dead-reckoning, which only adds up motion. That can be: as pub" in odd) == said
     (lost,) = ensemble_sentences([made(good=GOOD, bad=[None, *GOOD[1:]])])
     assert "bad 1 of 20 runs without" in lost
     assert ensemble_sentences([]) == []
@@ -92,7 +98,12 @@ def test_runs_are_kept_in_the_folder_and_stand_first_on_the_page_and_in_the_term
     assert again.ensembles[0].values == comparison.ensembles[0].values
     assert again.ensembles[0].nees["good"]["yaw"][0][0] is None, "what is not a number is null"
     page = render_report(again)
-    assert page.index("One run is one sample. This page") < page.index("20 runs by hand") < page.index("In the one run")
+    assert (
+        page.index("The basin is simulated")
+        < page.index("One run is one sample: this page")
+        < page.index("20 runs by hand")
+        < page.index("In the one run")
+    )
     assert 'id="figure-runs-1"' in page
     assert "20 runs by hand" in str(summary(again).renderables[-1])
     write_comparison(replace(comparison, ensembles=[]), tmp_path)
