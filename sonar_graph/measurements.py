@@ -226,8 +226,8 @@ class PositionFixes(Block):
     """Positions of an antenna or acoustic transponder in the world, from satellites or an acoustic array (USBL).
 
     A covariance with any NaN is unknown as a whole: the row is used, with ``positions.sigma_m`` of the calibration on
-    every axis. A coordinate that was not measured is no NaN, but has a variance of `UNMEASURED_M2`; a row without any is
-    left out of the block.
+    every axis. A coordinate that was not measured is no NaN, but has a variance of `UNMEASURED_M2`; a row without
+    any is left out of the block.
 
     Examples
     --------

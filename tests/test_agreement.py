@@ -17,6 +17,7 @@ from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.slam import GaussianKernel, Isam2, Isam2Params, KeyframeParams, RobustKernel, SmootherParams
 from sonar_graph.states import Estimate, Refusal
+from sonar_graph.testing import aided_world
 
 from .slam.rail import STEP_S, T0_NS, rail
 
@@ -269,3 +270,20 @@ def test_a_heading_or_fix_that_no_sensor_gives_is_named_and_changes_nothing(kind
     estimates = run(estimator, replace(sequence, **{sensor: replace(row, stamps_ns=np.array([at_ns]))}))
     assert [refused[:3] for refused in estimator.refused_rows()] == [(sensor, at_ns, Refusal.UNSOUND)]
     assert max(difference(estimates, run(others, sequence))) < 1e-9
+
+
+@pytest.mark.parametrize("kind", [EkfSlam, InvariantEkf, Isam2])
+def test_unknown_noise_of_a_heading_or_fix_is_the_calibration_s(kind):
+    """NaN, of a covariance anywhere in it; another noise is another result."""
+    world = aided_world()
+    heading, fixes = world.heading, world.positions
+    ends = []
+    for sigma in (np.nan, 1.0, 1.5):
+        noise = [sigma * known for known in (world.calibration.heading.sigma_rad, world.calibration.positions.sigma_m)]
+        covs = np.tile(np.diag(np.square(noise[1])), (len(fixes), 1, 1))
+        covs[:, 0, 1] = covs[:, 1, 0] = np.nan if np.isnan(sigma) else 0.0
+        told = replace(heading, sigma_rad=np.full(len(heading), noise[0])), replace(fixes, covariance_m2=covs)
+        sequence = replace(world, heading=told[0], positions=told[1])
+        ends.append(run(kind(world.calibration, Odometry(world.calibration)), sequence, 1.0))
+    assert max(difference(ends[0], ends[1])) < 1e-9
+    assert max(difference(ends[0], ends[2])) > 1e-4

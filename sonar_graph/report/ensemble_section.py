@@ -24,8 +24,8 @@ CAUSAL = (
     " (causal: told at once, from what was measured until then; after the best shift and turn of the whole path, SE(2))"
 )
 WORSE = (
-    " Here ekf-slam is worse than dead-reckoning, which only adds up motion. That can be: as published the filter has no"
-    " gyro bias in its state and believes identities, so a landmark taken for another moves vehicle and map for good."
+    " Here ekf-slam is worse than dead-reckoning, which only adds up motion. That can be: as published the filter has"
+    " no gyro bias in its state and believes identities, so a landmark taken for another moves vehicle and map for good."
 )
 LOW, HIGH = 0.1, 0.9
 """Quantiles of the runs between which the figure is shaded."""
