@@ -279,7 +279,7 @@ def test_unknown_noise_of_a_heading_or_fix_is_the_calibration_s(kind):
     heading, fixes = world.heading, world.positions
     ends = []
     for sigma in (np.nan, 1.0, 1.5):
-        noise = [sigma * known for known in (world.calibration.heading.sigma_rad, world.calibration.positions.sigma_m)]
+        noise = sigma * world.calibration.heading.sigma_rad, sigma * np.array(world.calibration.positions.sigma_m)
         covs = np.tile(np.diag(np.square(noise[1])), (len(fixes), 1, 1))
         covs[:, 0, 1] = covs[:, 1, 0] = np.nan if np.isnan(sigma) else 0.0
         told = replace(heading, sigma_rad=np.full(len(heading), noise[0])), replace(fixes, covariance_m2=covs)

@@ -25,7 +25,7 @@ CAUSAL = (
 )
 WORSE = (
     " Here ekf-slam is worse than dead-reckoning, which only adds up motion. That can be: as published the filter has"
-    " no gyro bias in its state and believes identities, so a landmark taken for another moves vehicle and map for good."
+    " no gyro bias in its state and believes identities, and a landmark taken for another moves path and map for good."
 )
 LOW, HIGH = 0.1, 0.9
 """Quantiles of the runs between which the figure is shaded."""

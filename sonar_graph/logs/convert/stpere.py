@@ -46,6 +46,7 @@ BODY_YAW_IMU_RAD = -np.pi / 2
 BODY_YAW_DVL_RAD = -np.pi / 3
 GYRO_Z_BIAS_RAD_S = -0.0116
 """About the body's z (up)."""
+COMPASS = HeadingCalibration(sigma_rad=0.1, bias_sigma_rad=0.1)
 
 
 def read_stpere(dataset_dir: Path) -> Sequence:
@@ -101,11 +102,12 @@ def read_stpere(dataset_dir: Path) -> Sequence:
             dvl=DvlCalibration(
                 velocity_sigma_m_s=(0.08, 0.08, 0.08), mounting=Mounting(rpy_rad=(0.0, 0.0, BODY_YAW_DVL_RAD))
             ),
-            heading=HeadingCalibration(sigma_rad=0.1, bias_sigma_rad=0.1),
+            heading=COMPASS,
             start=Start(
                 position_m=(x, y, 0.0),
                 rpy_rad=(0.0, 0.0, float(np.angle(np.exp(1j * start_yaw)))),
-                rpy_sigma_rad=(0.1, 0.1, 0.01),
+                # one row of the compass, with the error that all of its rows share
+                rpy_sigma_rad=(0.1, 0.1, float(np.hypot(COMPASS.sigma_rad, COMPASS.bias_sigma_rad))),
             ),
         ),
         imu=imu,

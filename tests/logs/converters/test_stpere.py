@@ -38,6 +38,9 @@ def test_axes_units_and_biases_are_those_found_in_the_data(folder):
     np.testing.assert_allclose(sequence.truth.positions[:, :2], [[0, 0.5 * k] for k in range(4)], atol=0.01)
     np.testing.assert_allclose(sequence.truth.positions[:, 2], [0, -1, -2, -3], atol=1e-6)
     np.testing.assert_allclose(sequence.calibration.start.rpy_rad, [0, 0, np.pi / 2], atol=1e-12)
+    compass = sequence.calibration.heading
+    shared_and_own = np.hypot(compass.bias_sigma_rad, compass.sigma_rad)
+    assert sequence.calibration.start.rpy_sigma_rad[2] == pytest.approx(shared_and_own), "the start is a compass' row"
 
 
 def test_a_missing_file_or_folder_is_named(folder):
