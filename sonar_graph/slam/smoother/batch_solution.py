@@ -368,6 +368,16 @@ def is_pose(key: int) -> bool:
     return bool(gtsam.symbolChr(key) == ord("x"))
 
 
+def is_landmark(key: int) -> bool:
+    """True for a landmark."""
+    return bool(gtsam.symbolChr(key) == ord("l"))
+
+
+def is_bias(key: int) -> bool:
+    """True for the biases of a stretch of time."""
+    return bool(gtsam.symbolChr(key) == ord("b"))
+
+
 def picked(values: gtsam.Values, keys: Iterable[int]) -> gtsam.Values:
     """Some of the variables, poses and vectors. GTSAM copies all that it is given for each factor in Python."""
     few = gtsam.Values()

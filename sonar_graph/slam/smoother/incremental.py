@@ -50,7 +50,7 @@ class SmootherParams(Section):
     """Change of a component of a variable (rad or m) above which the variable is relinearised."""
     relinearize_every: int = Field(5, ge=1)
     """Updates of which one relinearises, in a whole history; large changes do at once. A bounded one does at each."""
-    submap_keyframes: int = Field(50, ge=1)
+    submap_keyframes: int = Field(10, ge=1)
     """Number of keyframes older than the lag that are marginalised together, in a submap; of a whole history."""
     stale_shift_m: float = Field(0.1, gt=0)
     """Distance that a landmark may move before a bounded window starts again from a solution of its graph."""

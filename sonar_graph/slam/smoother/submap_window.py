@@ -1,107 +1,34 @@
 """Incremental solution over the whole run: the newest keyframes, submaps of the older ones, landmarks and biases.
 
 iSAM2 holds the keyframes of the last ``lag_s`` seconds with their own factors, and of the older ones only each one
-between two submaps (`submaps`, docs/theory/isam2.md). Nothing is given up: a submap keeps its factors, takes in late
-ones, and is linearised anew when its shape has changed; each update looks at one of them in turn.
+between two submaps (`submaps`, docs/theory/isam2.md). Two neighbours of the same size are joined, so that their number
+grows with the logarithm of the run. Nothing is given up: a submap keeps its factors, takes in late ones, and is
+linearised anew when its shape has changed. An update makes, joins or linearises anew one submap at most.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
-from itertools import pairwise
+from itertools import islice
 from typing import Any
 
 import gtsam
 import numpy as np
 
-from sonar_graph.slam.smoother.batch_solution import is_pose, picked, tangent_size
+from sonar_graph.slam.smoother.batch_solution import is_bias, is_landmark, is_pose, picked, tangent_size
 from sonar_graph.slam.smoother.fixed_lag import isam2_params, settle
-from sonar_graph.slam.smoother.submaps import SubmapFactor
+from sonar_graph.slam.smoother.submaps import Factor, Submap
 
-STALE = 0.02
-"""Change of the shape of a submap (rad or m) from which on it is linearised anew."""
-SETTLED = 0.002
-"""Decrease of the error (half a sum of squares) a keyframe, by a step of those of a submap, up to which they rest."""
 AT_ONCE = 100.0
 """Shift of a keyframe, in thresholds of relinearisation, from which on the next update relinearises. Not of landmarks:
 the height of one that is only seen from one level never comes to rest."""
-MOST = 50
-"""Submaps from which on neighbours are joined."""
+MOST_LOOKS = 3
+"""Submaps that an update looks at, and linearises anew where they are stale."""
 MOST_ROWS = 120
 """Rows of what a joined submap shares with the rest, at most: it is dense."""
 NEVER = 1 << 30
-Factor = gtsam.NonlinearFactor
-
-
-@dataclass(eq=False)
-class Submap:
-    """Keyframes between two others with their factors, or two such submaps and the keyframe between them."""
-
-    interior: list[int]
-    """Keys of its keyframes, in the order of time."""
-    factors: dict[Factor, None]
-    values: gtsam.Values
-    """Its keyframes where it was last linearised."""
-    net: gtsam.GaussianBayesNet | None = None
-    """Its keyframes given what it shares with the rest, both as steps from where it was linearised."""
-    summary: SubmapFactor | None = None
-    marginals: Sequence[Factor] = ()
-    """What stands for it elsewhere: the factor of the summary; absolute where no pose of it stays."""
-    is_settled: bool = False
-    ends: tuple[int, int] = (0, 0)
-    """Keys of the keyframes before and after it."""
-    parent: Submap | None = None
-    """The submap of which it is a part."""
-
-    def present(self, estimate: gtsam.Values) -> gtsam.Values:
-        """Its keyframes at their best, given the estimate of what stays, moved with the frame of the submap."""
-        if self.summary is None or self.net is None:
-            return self.values
-        motion, step = self.summary.motion(estimate), self.net.optimize(self.summary.step(estimate))
-        moved = gtsam.Values()
-        for key in self.interior:
-            moved.insert(key, motion.compose(self.values.atPose3(key).retract(step.at(key))))
-        return moved
-
-    def is_stale(self, estimate: gtsam.Values) -> bool:
-        """True when its keyframes were not at rest when it was linearised, or its shape has changed since."""
-        is_moved = self.summary is not None and np.abs(self.summary.deviation(estimate)[0]).max() > STALE
-        return is_moved or not self.is_settled
-
-    def linearise(self, estimate: gtsam.Values) -> None:
-        """Marginalise its factors at the estimate of what stays, and take a Gauss-Newton step of what does not."""
-        graph, order = gtsam.NonlinearFactorGraph(), gtsam.Ordering()
-        for factor in self.factors:
-            graph.add(factor)
-        for key in self.interior:
-            order.push_back(key)
-        inside = set(self.interior)
-        kept = [key for key in graph.keyVector() if key not in inside]
-        values = picked(estimate, kept)
-        step = values.zeroVectors()
-        interior = self.present(estimate)
-        values.insert(interior)
-        net, rest = graph.linearize(values).eliminatePartialSequential(order, gtsam.EliminateQR)
-        self.is_settled = net.error(values.zeroVectors()) <= SETTLED * len(self.interior)
-        self.values, self.net, self.summary = interior, net, None
-        poses = [key for key in kept if is_pose(key)]
-        if poses:
-            keys = [poses[0], *(key for key in kept if key != poses[0])]
-            order = gtsam.Ordering()
-            for key in keys:
-                order.push_back(key)
-            A, b = rest.jacobian(order)
-            if len(A) > A.shape[1]:
-                R = np.asarray(np.linalg.qr(np.column_stack([A, b]), "r"))[: A.shape[1]]
-                A, b = R[:, :-1], R[:, -1]
-            self.summary = SubmapFactor(keys, A, b, values)
-            self.marginals = [self.summary.factor()]
-        else:
-            self.values, self.net = interior.retract(net.optimize(step)), None
-            self.marginals = [gtsam.LinearContainerFactor(rest.at(i), values) for i in range(rest.size())]
 
 
 class SubmapWindow:
@@ -123,13 +50,18 @@ class SubmapWindow:
         params.relinearizeSkip = NEVER
         self._isam = gtsam.ISAM2(params)
         self._slots: dict[Factor, int] = {}
+        self._gone: list[int] = []
         self._marginals: dict[Factor, None] = {}
         self._times_s: dict[int, float] = {}
         self._on: dict[int, dict[Factor, None]] = defaultdict(dict)
         self._submaps: list[Submap] = []
+        self._inside: dict[Submap, gtsam.Values] = {}
         self._whole: list[Submap] = []
         self._of: dict[int, Submap] = {}
-        self._turn = self._updates = 0
+        self._newest: Submap | None = None
+        self._stale = self._stale_in_turn()
+        self._newest_bias = self._updates = 0
+        self._is_behind = False
 
     @property
     def marginals(self) -> gtsam.ISAM2:
@@ -163,15 +95,17 @@ class SubmapWindow:
         """
         self._begin_empty()
         self._times_s = {key: t for key, t in times_s.items() if is_pose(key)}
+        self._newest_bias = max(filter(is_bias, times_s), default=0)
         factors = [graph.at(i) for i in range(graph.size())]
         self._register(factors)
-        self._close(values, time_s)
+        while self._grow(values, time_s):
+            pass
         rest = gtsam.NonlinearFactorGraph()
         for factor in factors:
             if self._submap_of(factor) is None:
                 rest.add(factor)
         try:
-            self._feed(rest, picked(values, [key for key in list(values.keys()) if key not in self._of]), [])
+            self._feed(rest, picked(values, [key for key in list(values.keys()) if key not in self._of]))
         except RuntimeError:
             if self.is_by_qr:
                 raise
@@ -187,130 +121,156 @@ class SubmapWindow:
         removed: Sequence[Factor] = (),
     ) -> gtsam.Values:
         """Estimate with new factors and variables, without some of the factors; with keyframes of what was touched."""
-        new, slots, touched = gtsam.NonlinearFactorGraph(), list[int](), dict[Submap, None]()
+        new, touched = gtsam.NonlinearFactorGraph(), dict[Submap, None]()
         for factor in removed:
             if submap := self._submap_of(factor):
                 del submap.factors[factor]
-                touched[submap] = None
+                touched |= dict.fromkeys(submap.lineage())
             else:
-                slots.append(self._slots.pop(factor))
-                for key in filter(is_pose, list(factor.keys())):
-                    del self._on[key][factor]
+                self._take_out(factor)
         for factor in (graph.at(i) for i in range(graph.size())):
             if submap := self._submap_of(factor):
                 submap.factors[factor] = None
-                touched[submap] = None
+                touched |= dict.fromkeys(submap.lineage())
             else:
                 new.add(factor)
+        self._newest_bias = max(filter(is_bias, times_s), default=self._newest_bias)
         self._updates += 1
         is_due = self._updates % self.relinearised_every == 0 or not self._submaps
         shifts = self._isam.getDelta()
         is_due = is_due or any(np.abs(shifts.at(key)).max() > AT_ONCE * self._threshold for key in self._times_s)
-        estimate = self.estimate()
-        if self._whole and not touched and (not is_due or self.relinearised_every == 1):
-            self._turn = (self._turn + 1) % len(self._whole)
-            submap = self._whole[self._turn]
-            if submap.is_stale(self._around(submap, estimate)):
-                touched[submap] = None
-        slots += self._close(estimate, time_s)
+        known = gtsam.Values(values)
+        known.insert_or_assign(self.estimate())
+        for submap in sorted(touched, key=lambda submap: submap.level):
+            self._linearise(submap, known)
+        is_free = not touched and (not is_due or self._is_behind or self.relinearised_every == 1)
+        if is_free and not self._grow(known, time_s):
+            for submap in filter(None, islice(self._stale, MOST_LOOKS)):
+                self._linearise(submap, known)
+        self._is_behind = not is_free
         self._times_s |= {key: t for key, t in times_s.items() if is_pose(key)}
         self._register(new.at(i) for i in range(new.size()))
-        known = gtsam.Values(values)
-        known.insert_or_assign(estimate)
-        for submap in touched:
-            self._linearise(submap, known)
-        self._feed(new, values, slots, relinearises=is_due)
+        self._feed(new, values, relinearises=is_due)
         estimate = self.estimate()
         for submap in touched:
             estimate.insert_or_assign(submap.present(self._around(submap, estimate)))
         return estimate
 
     def _submap_of(self, factor: Factor) -> Submap | None:
-        """The submap that a factor belongs to: of several the innermost."""
+        """The submap that a factor belongs to: of several, each a part of the next, the innermost."""
         owners = [self._of[key] for key in list(factor.keys()) if key in self._of]
-        return next((one for one in owners if not any(one is other.parent for other in owners)), None)
+        return min(owners, key=lambda submap: submap.level, default=None)
 
     def _register(self, factors: Iterable[Factor]) -> None:
+        """Take note of factors on what may leave for a submap."""
         for factor in factors:
-            for key in filter(is_pose, list(factor.keys())):
-                if key not in self._of:
+            for key in list(factor.keys()):
+                if not is_landmark(key):
                     self._on[key][factor] = None
 
+    def _take_out(self, factor: Factor) -> None:
+        """Take a factor out of the window."""
+        for key in list(factor.keys()):
+            if key in self._on:
+                self._on[key].pop(factor, None)
+        if factor in self._slots:
+            self._gone.append(self._slots.pop(factor))
+
     def _around(self, submap: Submap, estimate: gtsam.Values) -> gtsam.Values:
-        """Estimate, with the keyframes of the submaps that a submap is part of."""
+        """Estimate, with the interior of the submaps that a submap is part of, kept while nothing changes."""
         if submap.parent is None:
             return estimate
-        values = gtsam.Values(self._around(submap.parent, estimate))
-        values.insert_or_assign(submap.parent.present(values))
-        return values
+        if submap.parent not in self._inside:
+            values = gtsam.Values(self._around(submap.parent, estimate))
+            values.insert_or_assign(submap.parent.present(values))
+            self._inside[submap.parent] = values
+        return self._inside[submap.parent]
 
     def _linearise(self, submap: Submap, estimate: gtsam.Values) -> None:
-        """Linearise a submap anew, and those that it is part of."""
-        old = submap.marginals
+        """Linearise a submap anew; the one that it is part of is not settled then."""
+        old, parent = submap.marginals, submap.parent
         submap.linearise(self._around(submap, estimate))
-        if submap.parent is not None:
+        self._inside.clear()
+        if parent is not None:
             for factor in old:
-                del submap.parent.factors[factor]
-            submap.parent.factors |= dict.fromkeys(submap.marginals)
-            self._linearise(submap.parent, estimate)
+                del parent.factors[factor]
+            parent.factors |= dict.fromkeys(submap.marginals)
+            parent.is_settled = False
 
-    def _close(self, estimate: gtsam.Values, time_s: float) -> list[int]:
-        """Make submaps of keyframes that are older than the lag, as many of them as fill one, between two that stay.
+    def _stale_in_turn(self) -> Iterator[Submap | None]:
+        """Submaps to be linearised anew, parts before the whole; one answer an update, None where there is none."""
 
-        Neighbours are joined while there are many, and what they share with the rest is not. Returns the places of the
-        factors that belong to submaps now.
-        """
-        gone: list[Factor] = []
+        def stale(submap: Submap) -> Iterator[Submap | None]:
+            if submap.has_changed(self._around(submap, self.estimate())):
+                for part in submap.parts:
+                    yield from stale(part)
+                yield submap if submap.is_stale(self._around(submap, self.estimate())) else None
+
         while True:
-            keys = list(self._times_s)
-            old = sum(t < time_s - self.lag_s for t in self._times_s.values())
-            if old <= self.size or len(keys) < self.size + 2:
-                break
-            interior, ends = keys[1 : self.size + 1], (keys[0], keys[self.size + 1])
-            gone += self._add(Submap(interior, {}, picked(estimate, interior), ends=ends), len(self._submaps), estimate)
-            for key in keys[: self.size + 1]:
-                del self._times_s[key]
-        while len(self._submaps) > MOST:
-            pairs = list(pairwise(self._submaps))
-            rows = [
-                sum(map(tangent_size, {k for part in pair for f in part.marginals for k in list(f.keys())}))
-                for pair in pairs
-            ]
-            place = int(np.argmin(rows))
-            if rows[place] > MOST_ROWS:
-                break
-            before, after = self._submaps[place : place + 2]
-            middle = [before.ends[1]]
-            joined = Submap(middle, {}, picked(estimate, middle), ends=(before.ends[0], after.ends[1]))
-            joined.factors = dict.fromkeys([*before.marginals, *after.marginals])
-            before.parent = after.parent = joined
-            del self._submaps[place : place + 2]
-            gone += self._add(joined, place, estimate)
-        return [self._slots.pop(factor) for factor in gone if factor in self._slots]
+            yield None
+            for submap in list(self._submaps):
+                yield from stale(submap)
+                yield None
 
-    def _add(self, submap: Submap, place: int, estimate: gtsam.Values) -> list[Factor]:
-        """Add a submap with the factors on its keyframes; these."""
-        on_it = {factor: None for key in submap.interior for factor in self._on.pop(key)}
-        submap.factors |= {factor: None for factor in on_it if self._submap_of(factor) is None}
-        self._of |= dict.fromkeys(submap.interior, submap)
-        self._submaps.insert(place, submap)
-        self._whole.append(submap)
-        submap.linearise(estimate)
-        return list(submap.factors)
+    def _grow(self, estimate: gtsam.Values, time_s: float) -> bool:
+        """Make one submap: of the newest and its equal before it, else of keyframes older than the lag."""
+        if self._newest is not None:
+            place = self._submaps.index(self._newest)
+            pair = tuple(self._submaps[max(place - 1, 0) : place + 1])
+            shared = {key for part in pair for factor in part.marginals for key in list(factor.keys())}
+            if len({part.level for part in pair}) < len(pair) and sum(map(tangent_size, shared)) <= MOST_ROWS:
+                self._add([pair[0].ends[1]], (pair[0].ends[0], pair[1].ends[1]), pair, estimate)
+                return True
+            self._newest = None
+        keys = list(self._times_s)
+        old = sum(t < time_s - self.lag_s for t in self._times_s.values())
+        if old <= self.size or len(keys) < self.size + 2:
+            return False
+        self._add(keys[1 : self.size + 1], (keys[0], keys[self.size + 1]), (), estimate)
+        for key in keys[: self.size + 1]:
+            del self._times_s[key]
+        return True
 
-    def _feed(
-        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, slots: list[int], *, relinearises: bool = False
+    def _add(
+        self, interior: list[int], ends: tuple[int, int], parts: tuple[Submap, ...], estimate: gtsam.Values
     ) -> None:
+        """Add a submap of keyframes, with biases on which nothing else hangs, and all factors on them."""
+        factors = {factor: None for part in parts for factor in part.marginals}
+        factors |= {factor: None for key in interior for factor in self._on[key]}
+        shared = {
+            key for whole in self._submaps if whole not in parts for f in whole.marginals for key in list(f.keys())
+        }
+        biases = sorted({key for factor in factors for key in list(factor.keys()) if is_bias(key)})
+        for key in biases:
+            alone = all(factor in factors or not any(map(is_pose, list(factor.keys()))) for factor in self._on[key])
+            if alone and key not in shared and key != self._newest_bias:
+                interior = [*interior, key]
+                factors |= self._on[key]
+        submap = Submap(interior, factors, picked(estimate, interior), ends, parts)
+        place = self._submaps.index(parts[0]) if parts else len(self._submaps)
+        self._submaps[place : place + len(parts)] = [submap]
+        self._whole.append(submap)
+        self._newest = submap
+        self._of |= dict.fromkeys(interior, submap)
+        for factor in factors:
+            self._take_out(factor)
+        for key in interior:
+            self._on.pop(key, None)
+        submap.linearise(estimate)
+
+    def _feed(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, *, relinearises: bool = False) -> None:
         """Bring the factors of submaps in line, and update."""
         present = {factor: None for submap in self._submaps for factor in submap.marginals}
-        slots += [
-            self._slots.pop(factor) for factor in self._marginals if factor not in present and factor in self._slots
-        ]
+        for factor in self._marginals:
+            if factor not in present:
+                self._take_out(factor)
         for factor in present:
             if factor not in self._slots:
                 graph.add(factor)
         self._marginals = present
-        result = self._isam.update(graph, values, slots, force_relinearize=relinearises)
+        gone, self._gone = self._gone, []
+        self._inside.clear()
+        result = self._isam.update(graph, values, gone, force_relinearize=relinearises)
         self._slots |= {graph.at(i): slot for i, slot in enumerate(result.getNewFactorsIndices())}
 
     def settle(self) -> None:
