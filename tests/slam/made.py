@@ -56,7 +56,6 @@ def smoother_with(
     params = SmootherParams(
         lag_s=lag_s,
         relinearize_threshold=relinearize_threshold,
-        relinearize_every=1,
         submap_keyframes=submap_keyframes,
         stale_shift_m=stale_shift_m,
         waiting_gain=waiting_gain,

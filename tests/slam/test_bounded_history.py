@@ -39,7 +39,7 @@ def test_causal_estimates_are_those_of_the_whole_history_to_a_fifth_of_their_sig
     for one, other in zip(whole, bounded, strict=True):
         sigmas = np.sqrt(np.diag(one.covariance))
         assert (np.abs(one.world_T_body.localCoordinates(other.world_T_body)) < 0.2 * sigmas).all()
-        assert np.diag(other.covariance) == pytest.approx(np.diag(one.covariance), rel=0.05)
+        assert np.diag(other.covariance) == pytest.approx(np.diag(one.covariance), rel=0.1)
 
 
 def test_poses_that_left_are_those_of_least_squares_as_far_as_the_lag_reached():

@@ -58,7 +58,6 @@ def ran(lag_s: float, history: str = "whole", kernel: str = "none") -> Isam2:
         simulate_mission(MissionOptions(duration_s=40.0, imu="mti1", landmarks=6)),
         smoother__lag_s=lag_s,
         smoother__submap_keyframes=3,
-        smoother__relinearize_every=1,
         history__policy=history,
         kernel__shape=kernel,
         smoother__waiting_gain=0.0,

@@ -322,7 +322,7 @@ def test_a_section_keeps_its_default_policy_where_none_is_given() -> None:
 
 def test_the_listing_has_every_setting_once_with_its_policy() -> None:
     listed = {setting.name: setting for setting in settings_of(Isam2Params)}
-    assert len(listed) == len(settings_of(Isam2Params)) == 25
+    assert len(listed) == len(settings_of(Isam2Params)) == 24
     assert listed["smoother.lag_s"].default == 15.0
     assert listed["identity.policy"].default == "robust"
     assert listed["identity.gate_probability"].meaning.endswith('Only with policy = "gate".')

@@ -48,8 +48,6 @@ class SmootherParams(Section):
     """Age from which poses are marginalised out of the incremental solution; a large value keeps all of them."""
     relinearize_threshold: float = Field(0.001, gt=0)
     """Change of a component of a variable (rad or m) above which the variable is relinearised."""
-    relinearize_every: int = Field(5, ge=1)
-    """Updates of which one relinearises, in a whole history; large changes do at once. A bounded one does at each."""
     submap_keyframes: int = Field(10, ge=1)
     """Number of keyframes older than the lag that are marginalised together, in a submap; of a whole history."""
     stale_shift_m: float = Field(0.1, gt=0)
@@ -130,9 +128,7 @@ class Smoother:
         self._bias: list[int] = []
         self._window: FixedLagWindow | SubmapWindow
         if departures is None:
-            self._window = SubmapWindow(
-                params.relinearize_threshold, params.lag_s, params.submap_keyframes, params.relinearize_every
-            )
+            self._window = SubmapWindow(params.relinearize_threshold, params.lag_s, params.submap_keyframes)
         else:
             self._window = FixedLagWindow(params.relinearize_threshold, params.lag_s)
         self._taken_up = gtsam.NonlinearFactorGraph(), gtsam.Values()

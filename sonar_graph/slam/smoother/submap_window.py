@@ -10,35 +10,26 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import partial
 from itertools import islice
 from typing import Any
 
 import gtsam
-import numpy as np
 
 from sonar_graph.slam.smoother.batch_solution import is_bias, is_landmark, is_pose, picked, tangent_size
 from sonar_graph.slam.smoother.fixed_lag import isam2_params, settle
 from sonar_graph.slam.smoother.submaps import Factor, Submap
 
-AT_ONCE = 100.0
-"""Shift of a keyframe, in thresholds of relinearisation, from which on the next update relinearises. Not of landmarks:
-the height of one that is only seen from one level never comes to rest."""
-MOST_LOOKS = 3
+MOST_LOOKS = 2
 """Submaps that an update looks at, and linearises anew where they are stale."""
 MOST_ROWS = 120
 """Rows of what a joined submap shares with the rest, at most: it is dense."""
-NEVER = 1 << 30
 
 
 class SubmapWindow:
     """Incremental solution over the whole run, by Cholesky, and by QR once that has given up."""
 
-    def __init__(
-        self, relinearize_threshold: float, lag_s: float, submap_keyframes: int, relinearised_every: int
-    ) -> None:
+    def __init__(self, relinearize_threshold: float, lag_s: float, submap_keyframes: int) -> None:
         self._threshold = relinearize_threshold
-        self.relinearised_every = relinearised_every
         self.lag_s = lag_s
         """Age (s) from which on keyframes may leave for submaps."""
         self.size = submap_keyframes
@@ -46,9 +37,7 @@ class SubmapWindow:
         self._begin_empty()
 
     def _begin_empty(self) -> None:
-        params = isam2_params(self._threshold, is_by_qr=self.is_by_qr)
-        params.relinearizeSkip = NEVER
-        self._isam = gtsam.ISAM2(params)
+        self._isam = gtsam.ISAM2(isam2_params(self._threshold, is_by_qr=self.is_by_qr))
         self._slots: dict[Factor, int] = {}
         self._gone: list[int] = []
         self._marginals: dict[Factor, None] = {}
@@ -60,8 +49,7 @@ class SubmapWindow:
         self._of: dict[int, Submap] = {}
         self._newest: Submap | None = None
         self._stale = self._stale_in_turn()
-        self._newest_bias = self._updates = 0
-        self._is_behind = False
+        self._newest_bias = 0
 
     @property
     def marginals(self) -> gtsam.ISAM2:
@@ -135,22 +123,16 @@ class SubmapWindow:
             else:
                 new.add(factor)
         self._newest_bias = max(filter(is_bias, times_s), default=self._newest_bias)
-        self._updates += 1
-        is_due = self._updates % self.relinearised_every == 0 or not self._submaps
-        shifts = self._isam.getDelta()
-        is_due = is_due or any(np.abs(shifts.at(key)).max() > AT_ONCE * self._threshold for key in self._times_s)
         known = gtsam.Values(values)
         known.insert_or_assign(self.estimate())
         for submap in sorted(touched, key=lambda submap: submap.level):
             self._linearise(submap, known)
-        is_free = not touched and (not is_due or self._is_behind or self.relinearised_every == 1)
-        if is_free and not self._grow(known, time_s):
+        if not touched and not self._grow(known, time_s):
             for submap in filter(None, islice(self._stale, MOST_LOOKS)):
                 self._linearise(submap, known)
-        self._is_behind = not is_free
         self._times_s |= {key: t for key, t in times_s.items() if is_pose(key)}
         self._register(new.at(i) for i in range(new.size()))
-        self._feed(new, values, relinearises=is_due)
+        self._feed(new, values)
         estimate = self.estimate()
         for submap in touched:
             estimate.insert_or_assign(submap.present(self._around(submap, estimate)))
@@ -258,7 +240,7 @@ class SubmapWindow:
             self._on.pop(key, None)
         submap.linearise(estimate)
 
-    def _feed(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, *, relinearises: bool = False) -> None:
+    def _feed(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
         """Bring the factors of submaps in line, and update."""
         present = {factor: None for submap in self._submaps for factor in submap.marginals}
         for factor in self._marginals:
@@ -270,12 +252,12 @@ class SubmapWindow:
         self._marginals = present
         gone, self._gone = self._gone, []
         self._inside.clear()
-        result = self._isam.update(graph, values, gone, force_relinearize=relinearises)
+        result = self._isam.update(graph, values, gone)
         self._slots |= {graph.at(i): slot for i, slot in enumerate(result.getNewFactorsIndices())}
 
     def settle(self) -> None:
         """Update until nothing would be relinearised any more."""
-        settle(partial(self._isam.update, force_relinearize=True), self._isam, self._threshold)
+        settle(self._isam.update, self._isam, self._threshold)
 
     def carried(self, values: gtsam.Values) -> gtsam.Values:
         """Values, with the keyframes of submaps moved with these."""

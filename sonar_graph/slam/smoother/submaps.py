@@ -27,9 +27,9 @@ from scipy.linalg import solve_triangular
 from sonar_graph.measurements import Floats
 from sonar_graph.slam.smoother.batch_solution import is_landmark, is_pose, picked, tangent_size
 
-CHANGED = 0.02
+CHANGED = 0.005
 """Change of the shape of a submap (rad or m) from which on it is asked whether its summary still holds."""
-TOLERANCE = 0.002
+TOLERANCE = 0.0005
 """Error (half a sum of squares) a variable of the interior by which a summary may be wrong."""
 MOST_STEPS = 5
 """Gauss-Newton steps of the interior of a submap, at most, each time that it is linearised."""
@@ -287,6 +287,8 @@ class Submap:
             self.is_settled = bool(0.5 * np.square(rows[:n, -1]).sum() <= TOLERANCE * len(self.interior))
             if self.is_settled:
                 break
+        if not np.diag(rows)[:n].all():
+            raise RuntimeError("submap: its factors leave a direction of its interior open")
         self.values, self._R, self._S, self._d = interior, rows[:n, :n], rows[:n, n:-1], rows[:n, -1]
         self._error = graph.error(values)
         self.summary = SubmapFactor(kept, rows[n:, n:-1], rows[n:, -1], values)
