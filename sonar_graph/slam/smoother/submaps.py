@@ -284,11 +284,11 @@ class Submap:
             values.insert(interior)
             stacked = np.column_stack(graph.linearize(values).jacobian(order))
             rows = np.asarray(np.linalg.qr(stacked, "r"))[: stacked.shape[1] - 1]
+            if not np.diag(rows)[:n].all():
+                raise RuntimeError("submap: its factors leave a direction of its interior open")
             self.is_settled = bool(0.5 * np.square(rows[:n, -1]).sum() <= TOLERANCE * len(self.interior))
             if self.is_settled:
                 break
-        if not np.diag(rows)[:n].all():
-            raise RuntimeError("submap: its factors leave a direction of its interior open")
         self.values, self._R, self._S, self._d = interior, rows[:n, :n], rows[:n, n:-1], rows[:n, -1]
         self._error = graph.error(values)
         self.summary = SubmapFactor(kept, rows[n:, n:-1], rows[n:, -1], values)
