@@ -218,9 +218,10 @@ def test_the_range_ends_at_two_seconds(offset_s):
 
 
 def test_an_offset_that_still_moves_after_the_last_step_is_not_known(monkeypatch):
-    assert searched(swaying, 0.25, noise=1e-6).reason == ""
+    assert searched(lambda t_s: swaying(2.0 * t_s), 0.28, noise=1e-6).reason == ""
     monkeypatch.setattr(time_offset, "ROUNDS", 1)
-    assert searched(swaying, 0.25, noise=1e-6).reason.startswith("it does not settle: after 1 steps near +0.25 s")
+    told = searched(lambda t_s: swaying(2.0 * t_s), 0.28, noise=1e-6).reason
+    assert told.startswith("it does not settle: after 1 steps near +0.28 s")
 
 
 def test_a_motion_that_repeats_is_named_with_two_of_its_places():

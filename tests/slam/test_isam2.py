@@ -301,7 +301,10 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         {"unknown.density_m2": 1, "lag_s": 20},
         "lag_s: there is no such field; did you mean smoother.lag_s? it has: keyframes, smoother, history, kernel",
     ),
-    "out of range": ({"identity.policy": "gate", "identity.gate_probability": 2}, "identity.gate_probability: Input"),
+    "out of range": (
+        {"identity.policy": "gate", "identity.gate_probability": 2},
+        "identity.gate_probability: expected a number",
+    ),
 }
 
 

@@ -88,9 +88,11 @@ class SubmapFactor:
         self._by_yaw = np.array(
             [np.square(A_k[:, :3] @ R[2]).sum() for A_k, R in zip(self._A_poses, self._R0, strict=True)]
         )
-        by_xy = [A_k[:, 3:] @ R.T[:, :2] for A_k, R in zip(self._A_poses, self._R0, strict=True)]
-        weights = np.array([0.5 * np.square(columns).sum() for columns in by_xy] + [0.0] * len(self._points))
-        weights[len(self._poses) :] = 0.5 * (np.square(self._A_x) + np.square(self._A_y)).sum(axis=0)
+        by_x = [A_k[:, 3:] @ R[0] for A_k, R in zip(self._A_poses, self._R0, strict=True)]
+        by_y = [A_k[:, 3:] @ R[1] for A_k, R in zip(self._A_poses, self._R0, strict=True)]
+        x, y = np.column_stack([*by_x, self._A_x]), np.column_stack([*by_y, self._A_y])
+        xx, yy, xy = np.square(x).sum(axis=0), np.square(y).sum(axis=0), (x * y).sum(axis=0)
+        weights = 0.5 * (xx + yy) - np.hypot(0.5 * (xx - yy), xy)  # of the direction that is known least
         total = weights.sum() if self._poses else 0.0
         self._shares = weights / total if total > 0.0 else 0.0 * weights
         positions = self._positions(values)
