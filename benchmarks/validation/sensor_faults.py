@@ -3,8 +3,9 @@
     python benchmarks/validation/sensor_faults.py [--quick] [--only REGULAR_EXPRESSION]
 
 The logs: a simulated mission (``mission``), a vehicle at sea with landmarks simulated along its reference (``akit``,
-trajectory 1), a robot with its own detections (``mrclam``, data set 6, robot 1). Each fault of `row_faults.py` is put
-into the messages of the log, which is written, read and compared as the command line does it.
+trajectory 1, with the Doppler log's noise that fits this reference: `akit_landmarks`), a robot with its own detections
+(``mrclam``, data set 6, robot 1). Each fault of `row_faults.py` is put into the messages of the log, which is written,
+read and compared as the command line does it.
 
 ``named``: the terminal names the fault, in the words that `row_faults.py` expects and that it does not print for the
 sound log; by ``compare``, or only by ``inspect``. ``excess``: position error (root mean square, causal, not aligned)
@@ -35,6 +36,7 @@ from unittest.mock import patch
 import numpy as np
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
+from akit_landmarks import SIGMA_AGAINST_REFERENCE_M_S
 from common import conclude, in_parallel, make_parser, note, print_table, recording
 from rich.console import Console
 from row_faults import FAULTS, NS, Effect, Fault
@@ -88,7 +90,11 @@ def log_of(data: Path, base: str) -> Sequence:
     if base == "akit":  # whose stamps begin at 0, which in a log means that there is none
         blocks = {name: replace(block, stamps_ns=block.stamps_ns + EPOCH_NS) for name, block in blocks.items()}
     short = replace(whole, **blocks)
-    return add_landmarks(short, SOUND_LANDMARKS) if base == "akit" else short
+    if base != "akit":
+        return short
+    seen = add_landmarks(short, SOUND_LANDMARKS)  # along the reference, whose positions are not the sum of velocities
+    dvl = seen.calibration.dvl.model_copy(update={"velocity_sigma_m_s": SIGMA_AGAINST_REFERENCE_M_S})
+    return replace(seen, calibration=seen.calibration.model_copy(update={"dvl": dvl}))
 
 
 @dataclass
