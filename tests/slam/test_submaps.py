@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, L, X
 
-from sonar_graph.slam.smoother import submap_window
+from sonar_graph.slam.smoother import FactorGroup, submap_window
 from sonar_graph.slam.smoother.batch_solution import picked
 from sonar_graph.slam.smoother.submap_window import Submap
 from sonar_graph.slam.smoother.submaps import SubmapFactor, turn_from, yaw_from
@@ -166,6 +166,18 @@ def test_in_the_basin_the_window_stays_near_the_batch(monkeypatch, most_rows):
         sigma_m = np.sqrt(fed.dense(batch, L(i)).diagonal().max())
         assert np.linalg.norm(fed.smoother.values.atPoint3(L(i)) - batch.atPoint3(L(i))) < 0.5 * sigma_m
     assert off_sigmas(fed.joint(*keys), exact) < 0.1
+
+
+def test_a_landmark_that_left_submaps_and_came_back_is_where_it_was():
+    fed, time_s = in_the_basin(40, 4.0), 39.0
+    batch, handles = fed.smoother.solve_history()[0].atPoint3(L(5)), fed.handles_on(L(5))
+    handles += [handle for k in range(40) for handle in fed.handles_on(X(k), L(5))]
+    groups = [FactorGroup(fed.groups[handle]) for handle in handles]
+    assert any(L(5) in submap.summary.keys for submap in fed.smoother._window._whole if submap.parent is not None)
+    fed.smoother.exchange(time_s, handles, lost_landmarks=[L(5)])
+    assert L(5) not in set(fed.smoother.values.keys())
+    fed.smoother.exchange(time_s, (), groups, {L(5): batch + 0.2})
+    assert fed.smoother.values.atPoint3(L(5)) == pytest.approx(batch, abs=1e-3)
 
 
 def test_an_update_makes_one_submap_or_linearises_few_anew(monkeypatch):

@@ -200,7 +200,8 @@ CLEARLY_WORSE = 16.0
 """Least chi-square by which any other minimum must be worse: four sigmas."""
 NEIGHBOURHOOD_S = 0.3
 ROUNDS = 6
-SETTLED_SIGMAS = 0.1
+SETTLED_SIGMAS = 0.5
+"""Largest last step of an offset that is known: its square would add a quarter to the variance."""
 LineUp = Callable[[float], Sequence[SampleSeries]]
 """The data lined up for an offset in seconds."""
 
@@ -286,7 +287,7 @@ def reason_not_unique(grid: Floats, chi2: Floats, best: int) -> str:
 def _converge(
     line_up: LineUp, prior_sigmas: Floats, ratios: Floats, offset_s: float, limits: tuple[float, float]
 ) -> OffsetFit:
-    """Gauss-Newton steps of the offset within limits; one that still moves by a tenth of its sigma is not known."""
+    """Gauss-Newton steps of the offset within limits; one that still moves by half its sigma is not known."""
     sigmas = np.concatenate([[PRIOR_OFFSET_S], prior_sigmas])
     for _ in range(ROUNDS):
         found = fit(_with_offset(line_up, offset_s, prior_sigmas, ratios), sigmas, ratios)

@@ -110,6 +110,7 @@ class SubmapWindow:
     ) -> gtsam.Values:
         """Estimate with new factors and variables, without some of the factors; with keyframes of what was touched."""
         new, touched = gtsam.NonlinearFactorGraph(), dict[Submap, None]()
+        self._inside.clear()
         for factor in removed:
             if submap := self._submap_of(factor):
                 del submap.factors[factor]
@@ -256,8 +257,18 @@ class SubmapWindow:
         self._slots |= {graph.at(i): slot for i, slot in enumerate(result.getNewFactorsIndices())}
 
     def settle(self) -> None:
-        """Update until nothing would be relinearised any more."""
-        settle(self._isam.update, self._isam, self._threshold)
+        """Update, and linearise stale submaps anew, until nothing would be relinearised any more; ten times at most."""
+        for _ in range(10):
+            settle(self._isam.update, self._isam, self._threshold)
+            self._inside.clear()
+            estimate = self.estimate()
+            around = {submap: self._around(submap, estimate) for submap in self._whole}
+            stale = [s for s, values in around.items() if s.has_changed(values) and s.is_stale(values)]
+            if not stale:
+                break
+            for submap in stale:
+                self._linearise(submap, estimate)
+            self._feed(gtsam.NonlinearFactorGraph(), gtsam.Values())
 
     def carried(self, values: gtsam.Values) -> gtsam.Values:
         """Values, with the keyframes of submaps moved with these."""
