@@ -18,9 +18,9 @@ import numpy as np
 from gtsam.symbol_shorthand import L, X
 from pydantic import model_validator
 
-from sonar_graph.calibration import Calibration, Section
+from sonar_graph.calibration import Calibration, Section, require_params
 from sonar_graph.errors import CalibrationError, EstimatorError
-from sonar_graph.measurements import NS_PER_S, Floats, Ints, Measurements, PositionFixes
+from sonar_graph.measurements import NS_PER_S, Floats, Ints, Measurements, PositionFixes, require_measurements
 from sonar_graph.motion import MotionSource, require_source
 from sonar_graph.slam.estimates import AnchoredPose, PoseHistory
 from sonar_graph.slam.frontend import Frontend
@@ -91,11 +91,7 @@ class Isam2:
     Params: ClassVar[type[Section]] = Isam2Params
 
     def __init__(self, calibration: Calibration, odometry: MotionSource, params: Any = None) -> None:
-        if not isinstance(params, Isam2Params | None):
-            raise EstimatorError(
-                f"isam2: params: expected Isam2Params or None, not {type(params).__name__}; of a dict:"
-                " Isam2Params(**params)"
-            )
+        require_params(params, self.Params, "isam2")
         require_source(odometry, calibration, "Isam2(calibration, odometry, params)")
         noise = {
             "imu.gyro_noise_density": calibration.imu.gyro_noise_density,
@@ -107,7 +103,8 @@ class Isam2:
             raise CalibrationError(
                 f"isam2: {', '.join(zero)} must be above zero; give a small value for what is known well"
             )
-        self._params = p = params or Isam2Params()
+        p: Isam2Params = params or Isam2Params()
+        self._params = p
         self._asked = PoseHistory()
         self._smoother = Smoother(p.smoother, self._asked if p.history.policy == "bounded" else None)
         self._keyframes = Keyframes(calibration, odometry, p.keyframes, self._smoother)
@@ -136,6 +133,7 @@ class Isam2:
 
         None before IMU and DVL have begun, and for an instant before that of an earlier call.
         """
+        require_measurements(measurements, "isam2")
         self._keyframes.add(measurements.imu, measurements.dvl, measurements.depth, measurements.heading)
         fixes = [] if measurements.positions is None else self._fixes(measurements.positions)
         if self._asked.newest_ns is not None and measurements.end_ns < self._asked.newest_ns:

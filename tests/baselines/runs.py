@@ -22,6 +22,7 @@ from sonar_graph.calibration import (
 from sonar_graph.measurements import NS_PER_S, Depth, Dvl, Heading, Imu, LandmarkDetections, Measurements, PositionFixes
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
+from sonar_graph.slam import Isam2
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks" / "performance"
 
@@ -35,18 +36,23 @@ STANDARD_FORCE = np.array([0.0, 0.0, 9.80665])
 NO_FORCE = (math.nan,) * 3
 
 
-def for_filters(*kinds):
-    names = {DeadReckoning: "dead-reckoning", EkfSlam: "ekf-slam", InvariantEkf: "invariant-ekf"}
-    return pytest.mark.parametrize("kind", kinds, ids=[names[kind] for kind in kinds])
+NAMES = {DeadReckoning: "dead-reckoning", EkfSlam: "ekf-slam", InvariantEkf: "invariant-ekf", Isam2: "isam2"}
 
 
-every_filter = for_filters(EkfSlam, InvariantEkf, DeadReckoning)
+def for_estimators(*kinds):
+    return pytest.mark.parametrize("kind", kinds, ids=[NAMES[kind] for kind in kinds])
 
 
-slam_filters = for_filters(EkfSlam, InvariantEkf)
+every_filter = for_estimators(EkfSlam, InvariantEkf, DeadReckoning)
 
 
-filters_with_bias = for_filters(InvariantEkf, DeadReckoning)
+every_estimator = for_estimators(*NAMES)
+
+
+slam_filters = for_estimators(EkfSlam, InvariantEkf)
+
+
+filters_with_bias = for_estimators(InvariantEkf, DeadReckoning)
 
 
 def later(*seconds):

@@ -18,12 +18,13 @@ from sonar_graph.slam.landmarks import ACCEPTED
 from sonar_graph.states import CausalEstimates, Estimate, Outcome, Refusal
 
 from .runs import (
+    NAMES,
     T0_NS,
     aided,
     begun,
     depths,
     dvl,
-    every_filter,
+    every_estimator,
     imu,
     in_a_gap,
     later,
@@ -218,9 +219,9 @@ def test_an_innovation_that_a_source_of_motion_lets_be_impossible_is_an_error_wi
         run(kind, in_a_gap(depths(np.array([later(1.0)]), 1.0, -1e6)))
 
 
-@every_filter
+@every_estimator
 def test_settings_and_measurements_of_another_type_are_refused_by_name(kind):
-    calibration, name = Calibration(), getattr(kind, "name", "dead-reckoning")
+    calibration, name = Calibration(), NAMES[kind]
     settings = kind.Params.__name__
     for params, given in (({"gravity_interval_s": 2.0}, "dict"), (kind.Params, f"the class {settings}")):
         said = rf"{name}: params: expected {settings} or None, not {given}; of a dict: {settings}\(\*\*params\)"

@@ -10,7 +10,6 @@ from gtsam.symbol_shorthand import B, L, X
 
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats
-from sonar_graph.navigation import Odometry
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 from sonar_graph.slam import Isam2
 from sonar_graph.slam.estimates import AnchoredPose
@@ -144,12 +143,6 @@ def test_a_covariance_that_cannot_be_is_refused_with_what_is_known(asked: dict, 
     with pytest.raises(EstimatorError, match=f"^isam2: {said}") as caught:
         (estimator.joint_covariance if is_joint else estimator.marginal)(**asked)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("params", [{"lag_s": 3}, {}, "robust"])
-def test_settings_are_of_their_own_type(params: object):
-    with pytest.raises(EstimatorError, match=r"^isam2: params: expected Isam2Params or None, not (dict|str)"):
-        Isam2(rail()[0].calibration, Odometry(rail()[0].calibration), params)
 
 
 def test_names_of_landmarks_without_names_are_refused_where_these_begin():
