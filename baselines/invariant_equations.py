@@ -86,7 +86,7 @@ class InvariantState:
 
     def D(self, motion: Motion) -> Floats:
         """Derivative of a motion from the state by the biases, shape (6, 11)."""
-        return by_biases(motion.D, motion.dR, motion.dp, self.up(), self.body_p_dvl)
+        return by_biases(motion.D, motion.dR, motion.dp, self.up(), self.R[2], self.body_p_dvl)
 
 
 def place_of(k: int) -> slice:

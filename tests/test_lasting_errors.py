@@ -11,7 +11,7 @@ from baselines.dead_reckoning import DeadReckoning
 from baselines.ekf_slam import EkfSlam
 from baselines.invariant_ekf import InvariantEkf
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting, Start
-from sonar_graph.measurements import Dvl, Heading, Imu, PositionFixes
+from sonar_graph.measurements import Depth, Dvl, Heading, Imu, PositionFixes
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.slam import Isam2
@@ -70,7 +70,7 @@ def split(sequence: Sequence) -> np.ndarray:
     motion = motion_of(sequence)
     dR, dp = motion.i_T_j.rotation().matrix(), motion.i_T_j.translation()
     up = sequence.calibration.start.pose().rotation().matrix()[2]
-    return by_biases(motion.D_bias, dR, dp, up, np.array(ARM))
+    return by_biases(motion.D_bias, dR, dp, up, up, np.array(ARM))
 
 
 def test_both_gyro_biases_are_the_gyros_and_one_turns_about_the_vertical_alone():
@@ -86,11 +86,16 @@ def test_both_gyro_biases_are_the_gyros_and_one_turns_about_the_vertical_alone()
 
 
 def test_the_scale_lengthens_the_way_of_the_doppler_log():
-    """By differences, with its lever arm; what is known of scale and gyro bias leaves the rows."""
+    """By differences, with its lever arm, level ways alone; what is known of scale and gyro bias leaves the rows."""
     exact, longer = motion_of(turning(known())), motion_of(turning(known(), scale=1e-4))
     moved = gtsam.Pose3.Logmap(longer.i_T_j.between(exact.i_T_j)) / 1e-4
-    np.testing.assert_allclose(split(turning(known()))[:, SCALE], moved, atol=1e-3)
-    assert np.abs(moved[3:]).max() > 1.0
+    dR, dp = exact.i_T_j.rotation().matrix(), exact.i_T_j.translation()
+    vertical = np.array([0.6, 0.0, 0.8])
+    level = np.eye(3) - np.outer(vertical @ dR, vertical @ dR)
+    for up in (vertical, np.zeros(3)):  # with gravity and without
+        by_b = by_biases(np.zeros((6, 3)), dR, dp, up, vertical, np.array(ARM))
+        np.testing.assert_allclose(by_b[:, SCALE], [*moved[:3], *(level @ moved[3:])], atol=1e-3)
+    assert np.abs(moved[3:] - level @ moved[3:]).max() > 0.1
     bias = np.array([0.01, -0.02, 0.03])
     sequence = turning(known(), scale=0.05)
     imu = sequence.calibration.imu.model_copy(update={"gyro_bias_rad_s": tuple(bias)})
@@ -154,6 +159,21 @@ def test_turns_tell_the_accelerometers_bias_from_a_tilt(kind):
             assert cov[6, 6] < 0.01 * 0.1**2
     assert found[0.1] < 1e-3
     assert found[1e-9] > 2 * found[0.1]
+
+
+@estimators
+@pytest.mark.parametrize("use_gravity", [True, False])
+def test_depth_tells_nothing_of_the_scale_by_noise(kind, use_gravity: bool):
+    """On a level path every vertical way is noise, which a scale error of 1 would explain."""
+    dvl = DvlCalibration(mounting=Mounting(translation_m=ARM), scale_sigma=0.2)
+    sequence = turning(known().model_copy(update={"dvl": dvl, "use_gravity": use_gravity}), roll_rad=0.0)
+    velocity = sequence.dvl.velocity.copy()
+    velocity[:, 2] += 0.01 * np.random.default_rng(0).standard_normal(len(velocity))
+    stamps_ns = sequence.imu.stamps_ns[::10]
+    depth = Depth(stamps_ns, np.zeros(len(stamps_ns)), np.full(len(stamps_ns), 1e-6))
+    b, cov = biases_of(ran(kind, replace(sequence, dvl=replace(sequence.dvl, velocity=velocity), depth=depth))[0])
+    assert b[SCALE] == pytest.approx(0.0, abs=1e-3)
+    assert cov[SCALE, SCALE] == pytest.approx(0.2**2, rel=1e-2)
 
 
 def headings(sequence: Sequence, off_rad: float, every: int = 10) -> Heading:

@@ -151,7 +151,7 @@ class PlainIsam2WithBias(PlainIsam2):
         dR, dp = motion.i_T_j.rotation().matrix(), motion.i_T_j.translation()
         up = (self._pose.rotation().matrix() @ dR.T)[2]
         body_p_dvl = np.array(self._calibration.dvl.mounting.translation_m)
-        D = by_biases(motion.D_bias, dR, dp, up, body_p_dvl)
+        D = by_biases(motion.D_bias, dR, dp, up, up, body_p_dvl)
         motion = replace(motion, D_bias=D, bias=np.zeros(BIASES))
         return OdometryWithBias(X(self._index), X(self._index + 1), B(0), motion)
 

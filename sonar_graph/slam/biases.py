@@ -35,11 +35,12 @@ def gyro_bias_of(b: Floats, up: Floats) -> Floats:
     return np.asarray(b[TILT] + up * (up @ (b[HEADING] - b[TILT])))
 
 
-def by_biases(D: Floats, dR: Floats, dp: Floats, up: Floats, body_p_dvl: Floats) -> Floats:
+def by_biases(D: Floats, dR: Floats, dp: Floats, up: Floats, vertical: Floats, body_p_dvl: Floats) -> Floats:
     """Derivative of a motion's [theta, rho] by b, shape (6, 11), from that by the gyro bias, ``D``, shape (6, 3).
 
     By b_heading the body turns about the world's vertical alone, whatever its tilt meanwhile: ``u_j u_j^T D_theta``,
-    with u at the end of the motion. A scale error lengthens the way of the Doppler log, ``dp + dR l - l``.
+    with u at the end of the motion. A scale error lengthens the way of the Doppler log, ``dp + dR l - l``, as far as it
+    is level: the vertical way is mostly noise, by which depth would measure the scale as too large.
 
     Parameters
     ----------
@@ -47,9 +48,12 @@ def by_biases(D: Floats, dR: Floats, dp: Floats, up: Floats, body_p_dvl: Floats)
         Mean of the motion.
     up
         The world's up in the body at its start, shape (3,); zero without gravity.
+    vertical
+        The same, with or without gravity.
     """
-    D_b, up_j = np.zeros((6, BIASES)), up @ dR
+    D_b, up_j, vertical_j = np.zeros((6, BIASES)), up @ dR, vertical @ dR
     D_b[:3, HEADING], D_b[3:, HEADING] = np.outer(up_j, up_j @ D[:3]), np.outer(D[3:] @ up, up)
     D_b[:, TILT] = D - D_b[:, HEADING]
-    D_b[3:, SCALE] = (body_p_dvl - dp) @ dR - body_p_dvl
+    way = (body_p_dvl - dp) @ dR - body_p_dvl
+    D_b[3:, SCALE] = way - vertical_j * (vertical_j @ way)
     return D_b

@@ -215,7 +215,7 @@ class Keyframes:
         bias = gyro_bias_of(biases, up)
         motion = self.odometry.motion(start_ns, end_ns, bias, attitude, known_ns)
         dR, dp = motion.i_T_j.rotation().matrix(), motion.i_T_j.translation()
-        D = by_biases(motion.D_bias, dR, dp, up, self._body_p_dvl)
+        D = by_biases(motion.D_bias, dR, dp, up, attitude[2], self._body_p_dvl)
         motion = replace(motion, D_bias=D, bias=np.concatenate((bias, bias, np.zeros(BIASES - 6))))
         return replace(motion, i_T_j=motion.corrected(biases), bias=biases)
 

@@ -76,14 +76,15 @@ STILL = motion_of(np.zeros(6), np.zeros((6, 6)))
 def pose_after(world: World, motion: Motion, eps: Floats = NOTHING) -> gtsam.Pose3:
     """True pose after a motion perturbed by [theta, rho] in its last frame, to which the biases add.
 
-    The gyros' turns about the world's vertical by the second, all else by the first; a scale error shortens the way.
+    The gyros' turns about the world's vertical by the second, all else by the first; a scale error shortens level ways.
     """
     off = world.bias - BIAS
     tilting, turning, scale = off[:3], off[3:6], off[10]
     up_i = world.R.T @ [0.0, 0.0, 1.0]
     up_j = motion.dR.T @ up_i
     theta = motion.D[:3] @ tilting + up_j * (up_j @ motion.D[:3] @ (turning - tilting))
-    rho = motion.D[3:] @ (tilting + up_i * (up_i @ (turning - tilting))) - scale * motion.dR.T @ motion.dp
+    rho = motion.D[3:] @ (tilting + up_i * (up_i @ (turning - tilting)))
+    rho -= scale * motion.dR.T @ (motion.dp - up_i * (up_i @ motion.dp))
     eps = eps + np.concatenate([theta, rho])
     i_T_j = gtsam.Pose3(gtsam.Rot3(motion.dR @ rotation(eps[:3])), motion.dp + motion.dR @ eps[3:])
     return gtsam.Pose3(gtsam.Rot3(world.R), world.X).compose(i_T_j)
