@@ -17,7 +17,7 @@ import gtsam
 
 from sonar_graph.slam.smoother.batch_solution import is_bias, is_landmark, is_pose, picked, tangent_size
 from sonar_graph.slam.smoother.fixed_lag import isam2_params, settle
-from sonar_graph.slam.smoother.submaps import Factor, Submap
+from sonar_graph.slam.smoother.submaps import BLAS, Factor, Submap
 
 MOST_LOOKS = 2
 """Submaps that an update looks at, and linearises anew where they are stale."""
@@ -253,7 +253,8 @@ class SubmapWindow:
         self._marginals = present
         gone, self._gone = self._gone, []
         self._inside.clear()
-        result = self._isam.update(graph, values, gone)
+        with BLAS.limit(limits=1, user_api="blas"):
+            result = self._isam.update(graph, values, gone)
         self._slots |= {graph.at(i): slot for i, slot in enumerate(result.getNewFactorsIndices())}
 
     def settle(self) -> None:

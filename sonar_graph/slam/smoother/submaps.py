@@ -23,6 +23,7 @@ from dataclasses import dataclass, field
 import gtsam
 import numpy as np
 from scipy.linalg import solve_triangular
+from threadpoolctl import ThreadpoolController
 
 from sonar_graph.measurements import Floats
 from sonar_graph.slam.smoother.batch_solution import is_landmark, is_pose, picked, tangent_size
@@ -33,6 +34,8 @@ TOLERANCE = 0.0005
 """Error (half a sum of squares) a variable of the interior by which a summary may be wrong."""
 MOST_STEPS = 5
 """Gauss-Newton steps of the interior of a submap, at most, each time that it is linearised."""
+BLAS = ThreadpoolController()
+"""Libraries of linear algebra: matrices of this size are faster by one thread, by far where others use the processor."""
 Factor = gtsam.NonlinearFactor
 
 I3, TWIST = np.eye(3), np.eye(6)[:, 2:5]
@@ -285,7 +288,8 @@ class Submap:
             values = picked(estimate, kept)
             values.insert(interior)
             stacked = np.column_stack(graph.linearize(values).jacobian(order))
-            rows = np.asarray(np.linalg.qr(stacked, "r"))[: stacked.shape[1] - 1]
+            with BLAS.limit(limits=1, user_api="blas"):
+                rows = np.asarray(np.linalg.qr(stacked, "r"))[: stacked.shape[1] - 1]
             if not np.diag(rows)[:n].all():
                 raise RuntimeError("submap: its factors leave a direction of its interior open")
             self.is_settled = bool(0.5 * np.square(rows[:n, -1]).sum() <= TOLERANCE * len(self.interior))
