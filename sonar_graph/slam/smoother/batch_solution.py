@@ -123,10 +123,10 @@ def descended(
     """Levenberg–Marquardt from ``initial``, in at most so many steps.
 
     Minimises the sum of squared whitened (and robustly weighted) errors. Damping multiplies the identity; it starts
-    negligible (a Gauss–Newton step) and grows tenfold while a step does not lower the error (Nocedal and Wright,
-    Numerical Optimization, section 10.3). A step is doubled while that lowers the error more: those of a robust
-    kernel fall short, since its weights are held while a step is solved for. After a step by which few keyframes move
-    much these are solved for, with all else held, before the next step of all.
+    negligible (a Gauss–Newton step) and grows, by 10, 100, 1000 and so on, while a step does not lower the error
+    (Nocedal and Wright, Numerical Optimization, section 10.3). A step is doubled while that lowers the error more:
+    those of a robust kernel fall short, since its weights are held while a step is solved for. After a step by
+    which few keyframes move much these are solved for, with all else held, before the next step of all.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ def descended(
         linear = stacked.linearize(values)
         if ordering is None:
             ordering = gtsam.Ordering.ColamdGaussianFactorGraph(linear)
-        candidate, candidate_error = values, np.inf
+        candidate, candidate_error, factor = values, np.inf, DAMPING_FACTOR
         while damping <= MAX_DAMPING and tried < most_steps:
             tried += 1
             try:
@@ -156,7 +156,7 @@ def descended(
                 candidate_error = np.inf
             if candidate_error < error:
                 break
-            damping *= DAMPING_FACTOR
+            damping, factor = damping * factor, factor * DAMPING_FACTOR
         else:
             break
         damping = max(damping / DAMPING_FACTOR, FIRST_DAMPING)
