@@ -26,7 +26,7 @@ EVERY_NODE = KeyframeParams(max_interval_s=0.1)
 SMOOTHERS = {
     name: Isam2Params(
         kernel=GaussianKernel(),
-        smoother=SmootherParams(lag_s=lag_s, relinearize_threshold=1e-6, submap_keyframes=20, waiting_gain=0.0),
+        smoother=SmootherParams(lag_s=lag_s, relinearize_threshold=1e-6, submap_keyframes=3, waiting_gain=0.0),
         keyframes=EVERY_NODE,
     )
     for name, lag_s in (("everything kept", 1e6), ("three seconds kept", 3.1))
@@ -95,7 +95,10 @@ def test_filters_judge_detections_as_the_smoother_does_by_default_and_ekf_slam_a
 @smoothers
 @pytest.mark.parametrize("with_fixes", [False, True])
 def test_filter_and_smoother_agree_where_all_is_linear(params, with_fixes):
-    """Between nodes too, and in all that is known of the pose; by position fixes between nodes as well."""
+    """Between nodes too, and in all that is known of the pose; by position fixes between nodes as well.
+
+    An azimuth says less of y from farther off, which filters do not linearise anew: 2e-6 of the variance of y.
+    """
     sequence, _ = rail(NODES)
     truth, fixes_ns = run(filters(sequence.calibration)[0], sequence), sequence.dvl.stamps_ns[1:-1] + NS_PER_S // 10
     x = np.array([[estimate.world_T_body.translation()[0] + 0.12, 0.0, 0.0] for estimate in truth])[: len(fixes_ns)]
@@ -103,8 +106,9 @@ def test_filter_and_smoother_agree_where_all_is_linear(params, with_fixes):
     aided = replace(sequence, positions=fixes) if with_fixes else sequence
     three = *filters(sequence.calibration), made(Isam2, sequence.calibration, params)
     ekf, invariant, smoother = (run(estimator, aided, 10) for estimator in three)
-    assert max(difference(ekf, smoother, slice(3, 6))) < 1e-6
-    assert max(difference(invariant, smoother, slice(3, 6))) < 1e-6
+    for estimates in (ekf, invariant):
+        assert max(difference(estimates, smoother, slice(3, 4))) < 1e-6
+        assert difference(estimates, smoother, slice(3, 6))[1] < 1e-5
     if with_fixes:
         assert difference(ekf, run(filters(sequence.calibration)[0], sequence, 10), slice(3, 4))[1] > 0.1
 

@@ -46,11 +46,15 @@ class Rail:
 
 
 def calibration() -> Calibration:
-    """Rotations are known; azimuth and elevation say nothing about x."""
+    """Rotations are known; azimuth and elevation say nothing about x.
+
+    The azimuth says where landmarks are sideways, to some metres. By ranges alone y is open at y = 0, and where they do
+    not fit yet, curvature makes Gauss-Newton wander off from there: a start of 1e-15 m is enough, with all poses kept.
+    """
     return Calibration(
         imu=ImuCalibration(gyro_noise_density=1e-9, gyro_bias_sigma=0.0),
         dvl=DvlCalibration(velocity_sigma_m_s=(VELOCITY_SIGMA_M_S,) * 3),
-        sonar=SonarCalibration(range_sigma_m=RANGE_SIGMA_M, azimuth_sigma_rad=1e3, elevation_aperture_rad=1e-3),
+        sonar=SonarCalibration(range_sigma_m=RANGE_SIGMA_M, azimuth_sigma_rad=0.2, elevation_aperture_rad=1e-3),
         start=Start(position_sigma_m=(START_SIGMA_M, 1e-3, 1e-3), rpy_sigma_rad=(1e-6,) * 3),
         use_gravity=False,
     )
