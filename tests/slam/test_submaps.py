@@ -99,7 +99,10 @@ def test_a_turn_about_the_vertical_leaves_the_tilt_as_it_was():
 
 
 def test_a_submap_that_moves_as_a_whole_stays_exact():
-    """Odometry, ranges and azimuths say the same of it anywhere; a fix of a position, once moved, does not."""
+    """Odometry, ranges and azimuths say the same of it anywhere; a fix of a position, once moved, does not.
+
+    So that one must be noticed, although its shape is as it was.
+    """
     fix = pose_prior(X(5), gtsam.Pose3(), 0.1)
     for more, is_relative in (((), True), ((fix,), False)):
         submap, values = basin_submap(*more)
@@ -110,6 +113,9 @@ def test_a_submap_that_moves_as_a_whole_stays_exact():
         anew.summary = None
         anew.linearise(moved)
         found, expected = (f.linearize(moved).augmentedInformation() for f in (factor, anew.marginals[0]))
+        assert submap.has_changed(moved) != is_relative
+        assert submap.is_stale(moved) != is_relative
+        assert not submap.is_stale(values)
         scale = np.abs(expected).max()
         assert np.allclose(found[:-1, :-1], expected[:-1, :-1], atol=1e-6 * scale) == is_relative
         assert (factor.error(moved) == pytest.approx(factor.error(values), abs=1e-6)) == is_relative
@@ -154,11 +160,12 @@ def test_joined_submaps_are_least_squares():
         assert x == pytest.approx(mean[f"x{k}"], abs=1e-8)
 
 
+@pytest.mark.parametrize("bias_steps", [7, 1000])
 @pytest.mark.parametrize("most_rows", [0, 1000])
-def test_in_the_basin_the_window_stays_near_the_batch(monkeypatch, most_rows):
+def test_in_the_basin_the_window_stays_near_the_batch(monkeypatch, most_rows, bias_steps):
     """After twenty circles, submaps joined and not: landmarks to half their sigmas, joint covariances to a tenth."""
     monkeypatch.setattr(submap_window, "MOST_ROWS", most_rows)
-    fed, keys = in_the_basin(80, 4.0), [X(79), L(3), L(5), L(8)]
+    fed, keys = in_the_basin(80, 4.0, bias_steps=bias_steps), [X(79), L(3), L(5), L(8)]
     assert (len(fed.smoother._window._submaps) < 10) == (most_rows > 0)
     batch, _ = fed.smoother.solve_history()
     exact = fed.dense(batch, *keys)
@@ -166,6 +173,52 @@ def test_in_the_basin_the_window_stays_near_the_batch(monkeypatch, most_rows):
         sigma_m = np.sqrt(fed.dense(batch, L(i)).diagonal().max())
         assert np.linalg.norm(fed.smoother.values.atPoint3(L(i)) - batch.atPoint3(L(i))) < 0.5 * sigma_m
     assert off_sigmas(fed.joint(*keys), exact) < 0.1
+
+
+def sigmas_off(fed: Fed) -> float:
+    """Largest deviation of a landmark of the basin from the batch solution, in standard deviations of all factors."""
+    batch, _ = fed.smoother.solve_history()
+    found = []
+    for i in (3, 5, 8):
+        off = fed.smoother.values.atPoint3(L(i)) - batch.atPoint3(L(i))
+        found.append(np.sqrt(off @ np.linalg.solve(fed.dense(batch, L(i)), off)))
+    return max(found)
+
+
+def test_settled_all_submaps_are_as_their_parts_are_now_however_deep(monkeypatch):
+    """When none has been linearised anew since it was made."""
+    monkeypatch.setattr(submap_window, "MOST_LOOKS", 0)
+    fed = in_the_basin(80, 4.0)
+    assert max(submap.level for submap in fed.smoother._window._submaps) > 4
+    assert sigmas_off(fed) > 0.2
+    fed.smoother.settle(79.0)
+    assert all(submap.is_settled for submap in fed.smoother._window._whole)
+    assert sigmas_off(fed) < 0.1
+
+
+def test_a_sighting_that_comes_when_its_keyframe_leaves_for_a_submap_counts():
+    """In the very update in which it leaves."""
+    fed, late = in_the_basin(40, 4.0), []
+    in_window = [k for k in range(40) if fed.smoother.in_window([X(k)])]
+    handles = [handle for k in in_window for handle in fed.handles_on(X(k), L(5))]
+    fed.smoother.exchange(39.0, handles)
+    without, _ = fed.smoother.solve_history()
+    for k in in_window[1:4]:
+        groups = [FactorGroup(fed.groups[handle]) for handle in fed.handles_on(X(k), L(5))]
+        was_inside = fed.smoother.in_window([X(k)])
+        assert not fed.smoother.exchange(60.0, (), groups).withheld
+        late.append(was_inside and not fed.smoother.in_window([X(k)]))
+    assert any(late)
+    batch, _ = fed.smoother.solve_history()
+    assert sigmas_off(fed) < 0.1
+    assert np.linalg.norm(batch.atPoint3(L(5)) - without.atPoint3(L(5))) > 5e-3
+
+
+def test_a_submap_that_leaves_a_direction_of_its_keyframes_open_is_refused():
+    values = values_of(X1=gtsam.Pose3(), L1=np.ones(3))
+    seen = gtsam.RangeFactor3D(X(1), L(1), 1.7, gtsam.noiseModel.Isotropic.Sigma(1, 0.1))
+    with pytest.raises(RuntimeError, match="open"):
+        Submap([X(1)], {seen: None}, picked(values, [X(1)])).linearise(values)
 
 
 def test_a_landmark_that_left_submaps_and_came_back_is_where_it_was():

@@ -109,7 +109,7 @@ class SubmapWindow:
         removed: Sequence[Factor] = (),
     ) -> gtsam.Values:
         """Estimate with new factors and variables, without some of the factors; with keyframes of what was touched."""
-        new, touched = gtsam.NonlinearFactorGraph(), dict[Submap, None]()
+        touched, outside = dict[Submap, None](), list[Factor]()
         self._inside.clear()
         for factor in removed:
             if submap := self._submap_of(factor):
@@ -122,17 +122,20 @@ class SubmapWindow:
                 submap.factors[factor] = None
                 touched |= dict.fromkeys(submap.lineage())
             else:
-                new.add(factor)
+                outside.append(factor)
+        self._register(outside)
         self._newest_bias = max(filter(is_bias, times_s), default=self._newest_bias)
         known = gtsam.Values(values)
         known.insert_or_assign(self.estimate())
-        for submap in sorted(touched, key=lambda submap: submap.level):
-            self._linearise(submap, known)
+        self._linearise_in_order(touched, known)
         if not touched and not self._grow(known, time_s):
             for submap in filter(None, islice(self._stale, MOST_LOOKS)):
                 self._linearise(submap, known)
         self._times_s |= {key: t for key, t in times_s.items() if is_pose(key)}
-        self._register(new.at(i) for i in range(new.size()))
+        new = gtsam.NonlinearFactorGraph()
+        for factor in outside:
+            if self._submap_of(factor) is None:
+                new.add(factor)
         self._feed(new, values)
         estimate = self.estimate()
         for submap in touched:
@@ -180,20 +183,25 @@ class SubmapWindow:
             parent.factors |= dict.fromkeys(submap.marginals)
             parent.is_settled = False
 
+    def _linearise_in_order(self, submaps: Iterable[Submap], estimate: gtsam.Values) -> None:
+        """Linearise submaps anew, parts before the whole."""
+        for submap in sorted(submaps, key=lambda submap: submap.level):
+            self._linearise(submap, estimate)
+
     def _stale_in_turn(self) -> Iterator[Submap | None]:
-        """Submaps to be linearised anew, parts before the whole; one answer an update, None where there is none."""
-
-        def stale(submap: Submap) -> Iterator[Submap | None]:
-            if submap.has_changed(self._around(submap, self.estimate())):
-                for part in submap.parts:
-                    yield from stale(part)
-                yield submap if submap.is_stale(self._around(submap, self.estimate())) else None
-
+        """Stale submaps; one answer for each that is looked at, and one an update where none has changed."""
         while True:
             yield None
             for submap in list(self._submaps):
-                yield from stale(submap)
+                yield from self._stale_of(submap)
                 yield None
+
+    def _stale_of(self, submap: Submap) -> Iterator[Submap | None]:
+        """Submaps to be linearised anew, of one and its parts, parts before the whole; None for those that are not."""
+        if submap.has_changed(self._around(submap, self.estimate())):
+            for part in submap.parts:
+                yield from self._stale_of(part)
+            yield submap if submap.is_stale(self._around(submap, self.estimate())) else None
 
     def _grow(self, estimate: gtsam.Values, time_s: float) -> bool:
         """Make one submap: of the newest and its equal before it, else of keyframes older than the lag."""
@@ -258,17 +266,18 @@ class SubmapWindow:
         self._slots |= {graph.at(i): slot for i, slot in enumerate(result.getNewFactorsIndices())}
 
     def settle(self) -> None:
-        """Update, and linearise stale submaps anew, until nothing would be relinearised any more; ten times at most."""
+        """Update, and linearise stale submaps anew, until nothing would be relinearised any more; ten times at most.
+
+        Each time with all that they are part of, so that what they say reaches the rest.
+        """
         for _ in range(10):
             settle(self._isam.update, self._isam, self._threshold)
             self._inside.clear()
-            estimate = self.estimate()
-            around = {submap: self._around(submap, estimate) for submap in self._whole}
-            stale = [s for s, values in around.items() if s.has_changed(values) and s.is_stale(values)]
+            looked_at = [stale for submap in self._submaps for stale in self._stale_of(submap)]
+            stale = dict.fromkeys(whole for submap in looked_at if submap is not None for whole in submap.lineage())
             if not stale:
                 break
-            for submap in stale:
-                self._linearise(submap, estimate)
+            self._linearise_in_order(stale, self.estimate())
             self._feed(gtsam.NonlinearFactorGraph(), gtsam.Values())
 
     def carried(self, values: gtsam.Values) -> gtsam.Values:

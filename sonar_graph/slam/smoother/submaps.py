@@ -35,6 +35,9 @@ TOLERANCE = 0.00005
 together, which moves an estimate by 0.3 of its sigma at most, where all of them err in one direction."""
 MOST_STEPS = 5
 """Gauss-Newton steps of the interior of a submap, at most, each time that it is linearised."""
+ROUNDING = 1e-6
+"""Share of its rows by which a motion in the plane may change a summary that says nothing of where it lies. Depths leave
+1e-7, by the large sigmas that stand for none; a position fix of 0.1 m to a keyframe or two makes 1e-2."""
 BLAS = ThreadpoolController()
 """Libraries of linear algebra: matrices of this size are faster by one thread, much so on a busy machine."""
 Factor = gtsam.NonlinearFactor
@@ -108,6 +111,7 @@ class SubmapFactor:
         self._A_rigid = self._by_motion(self._points_0)
         for A_k, Y in zip(self._A_poses, self._Y0, strict=True):
             self._A_rigid = self._A_rigid + A_k @ (Y.inverse().AdjointMap() @ TWIST)
+        self._is_absolute = bool(np.linalg.norm(self._A_rigid) > ROUNDING * np.linalg.norm(A))
 
     def factor(self) -> gtsam.NonlinearFactor:
         """The factor that GTSAM uses."""
@@ -163,9 +167,11 @@ class SubmapFactor:
         return np.concatenate(parts)
 
     def change_of_shape(self, values: gtsam.Values) -> float:
-        """Largest perturbation of a pose or landmark in the moved frame, rad or m."""
+        """Largest perturbation of a pose or landmark in the moved frame, rad or m; of an absolute one its turn, too."""
         n = 6 * len(self._poses) + 3 * len(self._points)
-        return float(np.abs(self.deviation(values)[0][:n]).max(initial=0.0))
+        xi, motion = self.deviation(values)
+        turn_rad = abs(motion.rotation().yaw()) if self._is_absolute else 0.0
+        return max(turn_rad, float(np.abs(xi[:n]).max(initial=0.0)))
 
     def _error(self, _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:
         T, s, c = self._fit(values)
@@ -291,7 +297,7 @@ class Submap:
             stacked = np.column_stack(graph.linearize(values).jacobian(order))
             with BLAS.limit(limits=1, user_api="blas"):
                 rows = np.asarray(np.linalg.qr(stacked, "r"))[: stacked.shape[1] - 1]
-            if not np.diag(rows)[:n].all():
+            if len(rows) < n or not np.diag(rows)[:n].all():
                 raise RuntimeError("submap: its factors leave a direction of its interior open")
             self.is_settled = bool(0.5 * np.square(rows[:n, -1]).sum() <= TOLERANCE * len(self.interior))
             if self.is_settled:
