@@ -36,8 +36,10 @@ together, which moves an estimate by 0.3 of its sigma at most, where all of them
 MOST_STEPS = 5
 """Gauss-Newton steps of the interior of a submap, at most, each time that it is linearised."""
 ROUNDING = 1e-6
-"""Share of its rows by which a motion in the plane may change a summary that says nothing of where it lies. Depths leave
-1e-7, by the large sigmas that stand for none; a position fix of 0.1 m to a keyframe or two makes 1e-2."""
+"""Share of its rows by which a motion in the plane may change a summary that says nothing of where it lies.
+
+Depths leave 1e-7, by the large sigmas that stand for none; a position fix of 0.1 m to one keyframe or two makes 1e-2.
+"""
 BLAS = ThreadpoolController()
 """Libraries of linear algebra: matrices of this size are faster by one thread, much so on a busy machine."""
 Factor = gtsam.NonlinearFactor
