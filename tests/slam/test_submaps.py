@@ -214,6 +214,23 @@ def test_a_sighting_that_comes_when_its_keyframe_leaves_for_a_submap_counts():
     assert np.linalg.norm(batch.atPoint3(L(5)) - without.atPoint3(L(5))) > 5e-3
 
 
+def test_where_cholesky_gives_up_on_a_sighting_from_inside_a_submap_qr_goes_on_with_it(monkeypatch):
+    fed, update = in_the_basin(40, 4.0), gtsam.ISAM2.update
+    window, handles = fed.smoother._window, fed.handles_on(X(9), L(5))
+    groups = [FactorGroup(fed.groups[handle]) for handle in handles]
+    fed.smoother.exchange(39.0, handles)
+
+    def giving_up(isam, *arguments):
+        if not window.is_by_qr:
+            raise RuntimeError("indeterminate")
+        return update(isam, *arguments)
+
+    monkeypatch.setattr(gtsam.ISAM2, "update", giving_up)
+    assert not fed.smoother.exchange(39.0, (), groups).withheld
+    assert window.is_by_qr
+    assert sigmas_off(fed) < 0.1
+
+
 def test_a_submap_that_leaves_a_direction_of_its_keyframes_open_is_refused():
     values = values_of(X1=gtsam.Pose3(), L1=np.ones(3))
     seen = gtsam.RangeFactor3D(X(1), L(1), 1.7, gtsam.noiseModel.Isotropic.Sigma(1, 0.1))

@@ -165,12 +165,15 @@ class Blame:
     def culprits(self, window: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> list[Withheld]:
         """New factors because of which a window cannot be solved; none where it can, if with better arithmetic.
 
-        An `EstimatorError` where a keyframe, or what was in the window before, is left open.
+        Those on keyframes in submaps have a part in its marginals. An `EstimatorError` where a keyframe, or what was in
+        the window before, is left open.
         """
-        graph = gtsam.NonlinearFactorGraph(window)
-        graph.push_back(self.graph)
+        graph, inside = gtsam.NonlinearFactorGraph(window), {*window.keyVector(), *self._new_keys}
+        for factor in map(self.graph.at, range(self.graph.size())):
+            if inside.issuperset(factor.keys()):
+                graph.add(factor)
         found: list[Withheld] = []
-        for open_ in left_open(graph, values, sorted({*graph.keyVector(), *self._new_keys})):
+        for open_ in left_open(graph, values, sorted(inside)):
             if gtsam.symbolChr(open_.key) == ord("x") or open_.key not in self._new_keys:
                 raise EstimatorError(f"isam2: {self._explained(open_, self._labelled(graph, open_.key))}")
             found.append(self._without(open_))
