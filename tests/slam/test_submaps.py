@@ -197,7 +197,7 @@ def test_settled_all_submaps_are_as_their_parts_are_now_however_deep(monkeypatch
 
 
 def test_a_sighting_that_comes_when_its_keyframe_leaves_for_a_submap_counts():
-    """In the very update in which it leaves."""
+    """In the very update in which it leaves; nothing is begun anew for it."""
     fed, late = in_the_basin(40, 4.0), []
     in_window = [k for k in range(40) if fed.smoother.in_window([X(k)])]
     handles = [handle for k in in_window for handle in fed.handles_on(X(k), L(5))]
@@ -209,6 +209,7 @@ def test_a_sighting_that_comes_when_its_keyframe_leaves_for_a_submap_counts():
         assert not fed.smoother.exchange(60.0, (), groups).withheld
         late.append(was_inside and not fed.smoother.in_window([X(k)]))
     assert any(late)
+    assert not fed.smoother._window.is_by_qr
     batch, _ = fed.smoother.solve_history()
     assert sigmas_off(fed) < 0.1
     assert np.linalg.norm(batch.atPoint3(L(5)) - without.atPoint3(L(5))) > 5e-3
