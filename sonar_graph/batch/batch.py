@@ -6,26 +6,23 @@ Decisions: docs/design/0011-batch.md.
 from __future__ import annotations
 
 import contextlib
-import signal
-import threading
 import tomllib
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from types import FrameType
 
 from sonar_graph.batch.plan import plan_runs
-from sonar_graph.batch.recorded import RecordedBatch, read_batch
+from sonar_graph.batch.recorded import RESULTS, RecordedBatch, read_batch
 from sonar_graph.batch.result_table import write_results
-from sonar_graph.batch.store import SUITE, Limits, PlannedRun, Progress, Row, RunOutcome, Store, Where, only_batch_in
+from sonar_graph.batch.store import BATCH, SUITE, Limits, PlannedRun, Progress, Row, RunOutcome, Store, Where
 from sonar_graph.batch.suite import SuiteFile, read_suite
 from sonar_graph.errors import BatchError
-from sonar_graph.files import replacing
+from sonar_graph.files import replacing, result_folder, result_written
+from sonar_graph.interrupts import deferred_interrupt, terminations_as_interrupts
 
-NEEDED_PACKAGES = ("distributed", "filelock", "pyarrow")
+NEEDED_PACKAGES = ("distributed", "pyarrow")
 INSTALL = "pip install 'sonar-graph[bench]'"
 
 
@@ -37,6 +34,7 @@ def run_suite(
     scheduler: str | None = None,
     timeout_s: float | None = None,
     retry_failed: bool = False,
+    overwrite: bool = False,
     progress: Callable[[int, int, int], None] | None = None,
 ) -> RecordedBatch:
     """Run a suite: logs or simulations, seeds, estimators and variants. Runs that are done already are kept.
@@ -58,6 +56,8 @@ def run_suite(
         Time limit of a run, in seconds; None: the suite's.
     retry_failed
         Do runs again that failed, timed out or were killed.
+    overwrite
+        Replace suite and table in the folder also where they are another suite's, or not this package's.
     progress
         Called at the start and after each run with the number of runs that are done, planned and failed.
 
@@ -106,7 +106,7 @@ def run_suite(
     if lacking := [name for name in NEEDED_PACKAGES if find_spec(name) is None]:
         raise BatchError(f"bench needs {lacking[0]}, which is not installed: {INSTALL}")
     file, folder = read_suite(Path(path)), Path(folder)
-    with Batch.opened(file, folder) as batch:
+    with Batch.opened(file, folder, overwrite=overwrite) as batch:
         if retry_failed:
             batch.discard_failed()
         statuses = Counter(str(row["status"]) for row in batch.rows().values())
@@ -138,26 +138,27 @@ class Batch:
 
     @classmethod
     @contextlib.contextmanager
-    def opened(cls, file: SuiteFile, folder: Path) -> Iterator[Batch]:
+    def opened(cls, file: SuiteFile, folder: Path, *, overwrite: bool = False) -> Iterator[Batch]:
         """Plan a suite, find its finished runs, and keep other batches out of the folder while the block runs.
 
         Raises
         ------
         BatchError
-            When the suite has a mistake, another batch runs in the folder, or it holds the batch of another suite; no
-            file in it is touched then, and no folder is made for a suite with a mistake.
+            When the suite has a mistake, another batch runs in the folder, or it holds the batch of another suite or
+            others' files of its names; no file in it is touched then, and no folder is made for a suite with a mistake.
         """
         runs = plan_runs(file)
         store = Store(folder)
-        with only_batch_in(folder):
+        with result_folder(folder, BATCH, overwrite=overwrite, refusal=BatchError) as written:
             with contextlib.suppress(OSError, ValueError):  # no suite here, or none that can be resumed
                 name = tomllib.loads((folder / SUITE).read_text(encoding="utf-8")).get("name")
-                if name != file.suite.name:  # a suite that was edited but has its name still goes on here
+                if name != file.suite.name and not overwrite:  # one that was edited but has its name goes on here
                     raise BatchError(
                         f"{folder}: holds the batch of suite {name!r}, and {file.path} is suite {file.suite.name!r}; "
-                        "choose another folder with -o, or, where it only has a new name, give it that name in "
-                        f"{folder / SUITE} too"
+                        "choose another folder with -o, or, where it only has a new name, give --overwrite"
                     )
+            with result_written(folder, BATCH):  # from here on the folder is known as a batch's
+                written.require([SUITE, RESULTS])
             store.remove_partial()
             yield cls(file, runs, store)
 
@@ -207,7 +208,7 @@ class Batch:
         return f"{len(self.rows())} of {len(self.runs)} runs are done and kept; the same command goes on from there"
 
     def _write_table(self) -> None:
-        with deferred_interrupt():
+        with deferred_interrupt(), result_written(self.store.folder, BATCH):
             with replacing(self.store.folder / SUITE) as partial:
                 partial.write_text(self.file.text, encoding="utf-8")
             write_results(self.store, self.file.suite, self.runs)
@@ -226,44 +227,3 @@ def limits_of(file: SuiteFile, timeout_s: float | None) -> Limits:
     """Limits of a suite's runs; a given timeout replaces the suite's."""
     limits = Limits(file.suite.timeout_s, file.suite.memory_mb)
     return limits if timeout_s is None else replace(limits, timeout_s=timeout_s)
-
-
-@contextmanager
-def terminations_as_interrupts() -> Iterator[None]:
-    """Treat SIGTERM, by which SLURM, Kubernetes and ``timeout`` end a job, like Ctrl-C inside the block."""
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        handler = signal.getsignal(signal.SIGINT)
-        (handler if callable(handler) else signal.default_int_handler)(number, frame)
-
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
-@contextmanager
-def deferred_interrupt() -> Iterator[None]:
-    """Defer a Ctrl-C that comes during the block to its end.
-
-    Compiled code that cannot raise (some of pyarrow) swallows the exception, and the batch would go on.
-
-    Raises `KeyboardInterrupt` at the end of the block, when the signal came in between; an error of the block is its
-    context.
-    """
-    handler = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or not callable(handler):
-        yield
-        return
-    came: list[tuple[int, FrameType | None]] = []
-    signal.signal(signal.SIGINT, lambda number, frame: came.append((number, frame)))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, handler)
-        if came:  # also when the block fails: a caller that passes over its error must not pass over the interrupt
-            handler(*came[0])

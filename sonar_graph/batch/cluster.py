@@ -26,6 +26,8 @@ from sonar_graph.errors import BatchError, SonarGraphError
 
 CONNECT_S = 30.0
 CLOSE_S = 5.0
+LOOPBACK = "127.0.0.1"
+"""Address on which this machine's scheduler, workers and their pages listen: no other machine reaches them."""
 DASK_SETTINGS = {
     "distributed.scheduler.allowed-failures": 1,
     "distributed.worker.memory.target": False,
@@ -128,7 +130,9 @@ def _local_client(workers: int) -> Iterator[Client]:
             threads_per_worker=1,
             processes=True,
             memory_limit=None,
-            dashboard_address=":0",
+            host=LOOPBACK,
+            dashboard_address=f"{LOOPBACK}:0",
+            worker_dashboard_address=f"{LOOPBACK}:0",
             silence_logs=logging.CRITICAL,
         )
     except RuntimeError as error:

@@ -41,6 +41,7 @@ from sonar_graph.evaluation import (
     run_estimator,
     write_comparison,
 )
+from sonar_graph.files import LOCK, MANIFEST
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import LandmarkOptions, add_landmarks
 
@@ -219,7 +220,9 @@ def main() -> None:
             with tempfile.TemporaryDirectory(prefix="sonar-graph-run-") as scratch:
                 folder = Path(scratch)
                 row = perform(request, folder)
-                paths = sorted(path for path in folder.rglob("*") if path.is_file())
+                paths = sorted(
+                    path for path in folder.rglob("*") if path.is_file() and path.name not in (MANIFEST, LOCK)
+                )
                 files = {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
             answer(RunOutcome(row, files))
         except Exception as error:  # for the process that waits for the answer

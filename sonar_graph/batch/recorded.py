@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from sonar_graph.batch.store import LOCK, LOG, NOT_RUN, ROW, RUNS, SUITE
+from sonar_graph.batch.store import BATCH, LOG, NOT_RUN, ROW, RUNS, SUITE
 from sonar_graph.errors import EvaluationError
-from sonar_graph.files import read_json
+from sonar_graph.files import kind_of, read_json
 from sonar_graph.measurements import Floats
 
 RESULTS = "results.parquet"
@@ -166,7 +166,7 @@ class RecordedBatch:
 
 def is_batch(folder: Path) -> bool:
     """True if a batch was begun in a folder."""
-    return any((folder / name).is_file() for name in (RESULTS, SUITE, LOCK))
+    return kind_of(folder) == BATCH or any((folder / name).is_file() for name in (RESULTS, SUITE))
 
 
 def read_batch(folder: Path, reference: str | None = None) -> RecordedBatch:

@@ -16,6 +16,7 @@ import gtsam
 from pydantic import Field
 
 from sonar_graph.calibration import Section
+from sonar_graph.files import regular
 from sonar_graph.logs import PartialCalibration, read_log
 from sonar_graph.logs.adapters import LogConfig, read_log_config
 from sonar_graph.logs.convert import read_akit, read_mrclam, read_victoria_park
@@ -146,7 +147,7 @@ def content_hash(files: tuple[tuple[str, str, Stamp], ...]) -> str:
     for name, path, _ in files:
         file = Path(path)
         digest.update(f"{len(name.encode())} {file.stat().st_size} {name}".encode())
-        with file.open("rb") as content:
+        with regular(file).open("rb") as content:
             while block := content.read(_BLOCK_BYTES):
                 digest.update(block)
     return digest.hexdigest()

@@ -3,6 +3,7 @@
 ::
 
     DIR/.lock                   held by the batch that runs
+    DIR/.sonar_graph.json       manifest of the folder (`sonar_graph.files`); each run has its own
     DIR/suite.toml              the suite as it was given, written when its first run is done
     DIR/results.parquet         one row for each planned run
     DIR/runs/KEY/row.json       the row of a run
@@ -14,16 +15,17 @@ with its final name is therefore complete. Decisions: docs/design/0011-batch.md.
 """
 
 import contextlib
-import shutil
-import uuid
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import hashlib
+import re
+import secrets
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 from sonar_graph.errors import BatchError, EvaluationError
-from sonar_graph.files import read_json, write_json
+from sonar_graph.evaluation import COMPARISON
+from sonar_graph.files import DIGEST_DIGITS, others_in, read_json, remove_written, strict_json, write_manifest
 
 Status = Literal["ok", "failed", "timeout", "memory", "killed"]
 NOT_RUN = "not run"
@@ -101,8 +103,11 @@ Progress = Callable[[PlannedRun, RunOutcome], None]
 """Called after a run is kept."""
 RUNS, ROW, LOG = "runs", "row.json", "log.txt"
 KEY = "key"
-SUITE, LOCK = "suite.toml", ".lock"
+SUITE = "suite.toml"
+BATCH = "batch"
+"""Kind of result in the manifest of a folder."""
 _PARTIAL = ".partial-"
+_PARTIAL_NAME = re.compile(r"\.partial-\w+-[0-9a-f]{8}")
 
 
 class Store:
@@ -121,7 +126,8 @@ class Store:
     def remove_partial(self) -> None:
         """Remove what a killed batch left half written or half removed; nothing else may be writing."""
         for path in (self.folder / RUNS).glob(f"{_PARTIAL}*"):
-            shutil.rmtree(path)
+            if _PARTIAL_NAME.fullmatch(path.name) and path.is_dir() and not path.is_symlink() and not others_in(path):
+                remove_written(path)
 
     def row(self, key: str) -> Row | None:
         """Row of a run; None if it is not done, or its row is lost or belongs to another run."""
@@ -135,61 +141,46 @@ class Store:
         """Keep a run.
 
         Raises `OSError` when there is no space; nothing of the run is left then, and no other run is touched.
+        Raises `BatchError` as `discard` does.
         """
         partial = self._partial_folder(key)
+        row = strict_json({KEY: key, **outcome.row}) + "\n"
+        contents = {**outcome.files, LOG: outcome.log.encode(), ROW: row.encode()}
+        digests = {name: [hashlib.blake2b(content).hexdigest()[:DIGEST_DIGITS]] for name, content in contents.items()}
+        partial.mkdir()
         try:
-            for name, content in {**outcome.files, LOG: outcome.log.encode()}.items():
+            write_manifest(partial, COMPARISON, digests)
+            for name, content in contents.items():
                 path = partial / name
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.write_bytes(content)
-            write_json(partial / ROW, {KEY: key, **outcome.row})
             self.discard(key)
             partial.rename(self.run_folder(key))
         finally:
-            shutil.rmtree(partial, ignore_errors=True)
+            if partial.exists():
+                remove_written(partial)
 
     def discard(self, key: str) -> None:
-        """Remove a run, so that it is done again."""
-        gone = self._partial_folder(key)
+        """Remove a run, so that it is done again.
+
+        Raises `BatchError` when its folder holds files that this package did not write.
+        """
+        folder, gone = self.run_folder(key), self._partial_folder(key)
+        if others := others_in(folder):
+            raise BatchError(
+                f"{folder}: would be replaced, and holds {others[0]}, which is not of the run; move it away"
+            )
         with contextlib.suppress(FileNotFoundError):
-            self.run_folder(key).rename(gone)
-        shutil.rmtree(gone, ignore_errors=True)
+            folder.rename(gone)
+            remove_written(gone)
 
     def run_folder(self, key: str) -> Path:
         """Folder of a run."""
         return self.folder / RUNS / key
 
     def _partial_folder(self, key: str) -> Path:
-        return self.folder / RUNS / f"{_PARTIAL}{key}-{uuid.uuid4().hex[:8]}"
+        return self.folder / RUNS / f"{_PARTIAL}{key}-{secrets.token_hex(4)}"
 
     def log_file(self, key: str) -> str:
         """Path of a run's log, relative to the store's folder."""
         return f"{RUNS}/{key}/{LOG}"
-
-
-@contextmanager
-def only_batch_in(folder: Path) -> Iterator[None]:
-    """Keep every other batch out of a folder while the block runs.
-
-    Two batches would remove each other's half-written runs and write one table. The operating system holds the lock
-    and releases it when the process ends, also by SIGKILL; the file that stays behind means nothing.
-
-    Raises `BatchError` when another batch runs there, or the file system has no locks.
-    """
-    from filelock import FileLock, Timeout  # of the extra `bench`
-
-    lock = FileLock(folder / LOCK, timeout=0, fallback_to_soft=False)
-    try:
-        lock.acquire()
-    except Timeout:
-        raise BatchError(
-            f"{folder}: another batch is running in this folder; wait for its end, or choose another folder with -o"
-        ) from None
-    except (OSError, NotImplementedError) as error:
-        raise BatchError(
-            f"{folder}: cannot be locked against a second batch ({error}); choose another file system with -o"
-        ) from error
-    try:
-        yield
-    finally:
-        lock.release()

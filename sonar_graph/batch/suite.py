@@ -37,6 +37,7 @@ from pydantic import BeforeValidator, Field, ValidationError, field_validator, m
 from sonar_graph.calibration import Section
 from sonar_graph.errors import BatchError
 from sonar_graph.evaluation import SCORES
+from sonar_graph.files import regular
 from sonar_graph.settings import choice, faults_in, flattened
 
 Place = tuple[int | str, ...]
@@ -189,11 +190,11 @@ def read_suite(path: Path) -> SuiteFile:
         When it cannot be read, is no TOML, or a value is missing, unknown or does not fit.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = regular(path).read_text(encoding="utf-8")
         values = tomllib.loads(text)
     except (OSError, UnicodeDecodeError) as error:
         raise BatchError(f"{path}: cannot be read: {error}") from error
-    except tomllib.TOMLDecodeError as error:
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise BatchError(f"{path}: not TOML: {error}") from error
     try:
         suite = Suite.model_validate(values)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_type_hints
 
 import typer
 from rich.console import Console
+from rich.text import Text
 
 from sonar_graph.errors import EstimatorError, LogError
 
@@ -36,7 +37,9 @@ LogPath = Annotated[
     Path, typer.Argument(metavar="LOG", exists=True, dir_okay=False, readable=True, help="MCAP log to read.")
 ]
 OutputLog = Annotated[Path, typer.Option("--output", "-o", metavar="OUT.mcap", help="MCAP log to write.")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a file even where sonar-graph did not write it.")]
+Overwrite = Annotated[
+    bool, typer.Option("--overwrite", help="Replace files of these names even where sonar-graph did not write them.")
+]
 OutputFolder = Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Folder to write to.")]
 RateHz = Annotated[
     float,
@@ -246,7 +249,28 @@ def examples(*commands: str) -> str:
     return "\n\n".join(["Examples:", *commands])
 
 
+def printable(text: str) -> str:
+    """Text without what a terminal would obey: names in a log may hold escape sequences, which are spelt out."""
+    return "".join(
+        char if char.isprintable() or char in "\n\t" else f"\\u{ord(char):04x}" if ord(char) < 0x10000 else "?"
+        for char in text
+    )
+
+
+def echo(text: str, *, err: bool = False, nl: bool = True) -> None:
+    """Print a text that may hold names of a log."""
+    typer.echo(printable(text), err=err, nl=nl)
+
+
+class PlainConsole(Console):
+    """Console for texts that may hold names of a log."""
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Text of a cell or line, without what a terminal would obey."""
+        return super().render_str(printable(text), **options)
+
+
 def answers() -> Console:
     """Console for results on stdout; if that is no terminal, it is `FILE_WIDTH` wide."""
-    console = Console(highlight=False)
-    return console if console.is_terminal else Console(highlight=False, width=FILE_WIDTH)
+    console = PlainConsole(highlight=False)
+    return console if console.is_terminal else PlainConsole(highlight=False, width=FILE_WIDTH)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import sys
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,14 +11,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer.core import TyperGroup
 
-from sonar_graph.cli.arguments import OutputFolder, examples
+from sonar_graph.cli.arguments import OutputFolder, Overwrite, echo, examples
 from sonar_graph.cli.outputs import progress_bars, working, writable_json
+from sonar_graph.interrupts import INTERRUPTED
 
 if TYPE_CHECKING:
     from sonar_graph.batch import GateVerdict
 
 
-INTERRUPTED = 130
 SHOWN = 10
 """Most lines about runs that stand out; the report lists every run."""
 BatchFolder = Annotated[
@@ -59,6 +58,7 @@ def bench(
         ),
     ] = None,
     is_strict: Strict = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Run a suite: logs or simulations, seeds, estimators and variants. Runs that are done already are kept.
 
@@ -82,16 +82,17 @@ def bench(
                 scheduler=scheduler,
                 timeout_s=timeout_s,
                 retry_failed=retry_failed,
+                overwrite=overwrite,
                 progress=progress,
             )
     except KeyboardInterrupt as error:
-        print(f"sonar-graph: interrupted; {error}".rstrip("; "), file=sys.stderr, flush=True)
+        echo(f"sonar-graph: interrupted; {error}".rstrip("; "), err=True)
         os._exit(INTERRUPTED)  # the ordinary way waits for threads, also for those of workers that are gone
     counts = Counter(run.status for run in batch.runs)
     told = sorted(counts.items(), key=lambda count: (count[0] != "ok", count[0]))
-    typer.echo(f"Runs: {', '.join(f'{number} {status}' for status, number in told)}")
-    typer.echo(f"Results: {output / 'results.parquet'}")
-    typer.echo(f"Report: {write_report_of(output)}")
+    echo(f"Runs: {', '.join(f'{number} {status}' for status, number in told)}")
+    echo(f"Results: {output / 'results.parquet'}")
+    echo(f"Report: {write_report_of(output, overwrite=overwrite)}")
     if reference is not None:
         exit_by_gate(output, reference, is_strict=is_strict)
     elif set(counts) - {"ok"}:
@@ -106,10 +107,10 @@ def exit_by_gate(folder: Path, reference: Path, *, is_strict: bool) -> None:
     with working("judging"):
         verdict = judge(read_batch(folder), reference)
     for line in verdict_lines(verdict):
-        typer.echo(line)
+        echo(line)
     is_passed = verdict.passed and not (is_strict and verdict.look_at)
     outcome = "failed" if not is_passed else "passed" if verdict.has_test else "passed, without any test of errors"
-    typer.echo(f"Gate: {outcome}, {verdict.compared} runs held against {reference}")
+    echo(f"Gate: {outcome}, {verdict.compared} runs held against {reference}")
     if not is_passed:
         raise typer.Exit(1)
 
@@ -137,16 +138,16 @@ def verdict_lines(verdict: GateVerdict) -> list[str]:
     return lines
 
 
-def write_report_of(folder: Path) -> Path:
+def write_report_of(folder: Path, *, overwrite: bool = False) -> Path:
     """Write the page and the tables of a batch from its results, and warn of runs that are missing."""
     from sonar_graph.batch import read_batch
     from sonar_graph.report import lost_told, missing_told, write_batch_report
 
     with working("drawing"):
         batch = read_batch(folder)
-        page = write_batch_report(batch, folder)
+        page = write_batch_report(batch, folder, overwrite=overwrite)
     for sentence in [*missing_told(batch), *lost_told(batch)]:
-        typer.echo(f"Warning: {sentence}", err=True)
+        echo(f"Warning: {sentence}", err=True)
     return page
 
 
@@ -196,7 +197,7 @@ def bless(
     batch = read_batch(folder)
     write_reference(batch, writable_json(reference, []))
     failed = sum(not run.ended for run in batch.runs)
-    typer.echo(f"Reference: {reference} ({len(batch.runs)} runs, {failed} of which did not end)")
+    echo(f"Reference: {reference} ({len(batch.runs)} runs, {failed} of which did not end)")
 
 
 @benches.command(epilog=examples("sonar-graph bench gate results reference.json"))

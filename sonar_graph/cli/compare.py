@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
@@ -15,9 +17,11 @@ from sonar_graph.cli.arguments import (
     EstimatorSettings,
     LogPath,
     OutputFolder,
+    Overwrite,
     RateHz,
     ReadingOptions,
     answers,
+    echo,
     estimator_settings,
     with_options,
 )
@@ -35,7 +39,7 @@ DEFAULT_ESTIMATORS = "isam2,ekf-slam,dead-reckoning"
 DEFAULT_RATE_HZ = 2.0
 RATE_SLACK = 1.01
 """Tolerance for the IMU's rate, which is counted from its stamps."""
-LOG = "basin.mcap"
+LOG, PAGE = "basin.mcap", "report.html"
 DEMO = {
     **{"duration_s": 390.0, "laps": 3, "imu": "mti1", "dvl": "explorer", "image": {}},
     **{"gyro_bias_scale": 10.0, "dvl_dropouts_per_hour": 30.0, "dvl_dropout_s": 5.0},
@@ -61,12 +65,18 @@ def run(
     estimator: Annotated[str, typer.Option("--estimator", help="Name of an installed estimator.")] = "isam2",
     rate_hz: RateHz = DEFAULT_RATE_HZ,
     settings: EstimatorSettings = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Run one estimator on a log; write its trajectories, landmarks and scores."""
-    from sonar_graph.evaluation import write_comparison, write_viewer_files
+    from sonar_graph.evaluation import COMPARISON, write_comparison, write_viewer_files
+    from sonar_graph.files import result_written
 
-    comparison = compare_log(log, output, [estimator], reading, RecogniserOptions(), rate_hz, settings)
-    with working("writing results"):
+    names, recognition = [estimator], RecogniserOptions()
+    with (
+        compared(log, output, names, reading, recognition, rate_hz, settings, overwrite=overwrite) as comparison,
+        working("writing results"),
+        result_written(output, COMPARISON),
+    ):
         write_comparison(comparison, output)
         write_viewer_files(comparison, output)
     print_outcome(comparison, f"Results: {output}")
@@ -81,6 +91,7 @@ def compare(
     estimators: Annotated[str, typer.Option(help="Names of installed estimators, with commas.")] = DEFAULT_ESTIMATORS,
     rate_hz: RateHz = DEFAULT_RATE_HZ,
     settings: EstimatorSettings = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Run several estimators on the same measurements and write a report on how they compare.
 
@@ -99,8 +110,10 @@ def compare(
         )
     if again is not None:
         raise EstimatorError(f"--estimators {estimators!r}: {again} is named twice; each runs once")
-    comparison = compare_log(log, output, names, reading, recognition, rate_hz, settings)
-    with working("writing results"):
+    with (
+        compared(log, output, names, reading, recognition, rate_hz, settings, overwrite=overwrite) as comparison,
+        working("writing results"),
+    ):
         page = write_report(comparison, output)
     print_outcome(comparison, f"Report: {page}")
 
@@ -109,22 +122,24 @@ def report(
     folder: Annotated[
         Path, typer.Argument(metavar="DIR", exists=True, file_okay=False, help="Folder that compare or bench wrote.")
     ],
+    overwrite: Overwrite = False,
 ) -> None:
     """Write report.html, and a batch's tables, anew from what compare, run or bench left in a folder."""
-    from sonar_graph.batch import is_batch
+    from sonar_graph.batch import BATCH, is_batch
     from sonar_graph.evaluation import read_comparison
     from sonar_graph.report import write_page
 
     if is_batch(folder):
-        page = write_report_of(writable_folder(folder))
+        with writable_folder(folder, [PAGE], kind=BATCH, overwrite=overwrite):
+            page = write_report_of(folder)
     else:
         comparison = read_comparison(folder)
-        with working("drawing"):
-            page = write_page(comparison, writable_folder(folder))
-    typer.echo(f"Report: {page}")
+        with working("drawing"), writable_folder(folder, [PAGE], overwrite=overwrite):
+            page = write_page(comparison, folder)
+    echo(f"Report: {page}")
 
 
-def demo(output: OutputFolder = Path("demo")) -> None:
+def demo(output: OutputFolder = Path("demo"), overwrite: Overwrite = False) -> None:
     """Repeat the 2014 paper's basin experiment in short: simulate sonar images, recognise landmarks, compare, report.
 
     Three laps in 390 s instead of 2039 s; the log takes about 90 MB. Then twenty more runs of the same
@@ -134,20 +149,22 @@ def demo(output: OutputFolder = Path("demo")) -> None:
     from sonar_graph.report import write_report
     from sonar_graph.simulation import BasinOptions
 
-    log = writable_log(writable_folder(output) / LOG)
-    options = BasinOptions.model_validate(DEMO)
-    typer.echo(f"Simulating {options.duration_s:g} s in a basin, {options.laps} laps, with sonar images: {log}")
-    write_basin(log, options)
-    typer.echo("Recognising landmarks in them, then running the estimators")
     names = DEFAULT_ESTIMATORS.split(",")
-    comparison = compare_log(log, output, names, ReadingOptions(), RecogniserOptions(), DEFAULT_RATE_HZ, None)
-    experiments = {name: options.model_copy(update=changes) for name, changes in DEMO_EXPERIMENTS.items()}
-    typer.echo(f"Running {len(experiments)} times {len(DEMO_SEEDS)} more of the same basin, without images")
-    with progress_bars() as progress:
-        ensembles = run_ensembles(experiments, DEMO_SEEDS, names, progress=progress)
-    comparison = replace(comparison, ensembles=ensembles)
-    with working("writing results"):
-        page = write_report(comparison, output)
+    with writable_folder(output, result_names(names), overwrite=overwrite):
+        log = writable_log(output / LOG, overwrite=overwrite)
+    options = BasinOptions.model_validate(DEMO)
+    echo(f"Simulating {options.duration_s:g} s in a basin, {options.laps} laps, with sonar images: {log}")
+    write_basin(log, options)
+    echo("Recognising landmarks in them, then running the estimators")
+    reading, recognition = ReadingOptions(), RecogniserOptions()
+    with compared(log, output, names, reading, recognition, DEFAULT_RATE_HZ, None, overwrite=overwrite) as comparison:
+        experiments = {name: options.model_copy(update=changes) for name, changes in DEMO_EXPERIMENTS.items()}
+        echo(f"Running {len(experiments)} times {len(DEMO_SEEDS)} more of the same basin, without images")
+        with progress_bars() as progress:
+            ensembles = run_ensembles(experiments, DEMO_SEEDS, names, progress=progress)
+        comparison = replace(comparison, ensembles=ensembles)
+        with working("writing results"):
+            page = write_report(comparison, output)
     print_outcome(comparison, f"Report: {page}")
 
 
@@ -175,7 +192,15 @@ def estimators() -> None:
         raise typer.Exit(1)
 
 
-def compare_log(
+def result_names(estimators: list[str]) -> list[str]:
+    """Names of the files that a comparison of some estimators may write."""
+    from sonar_graph.evaluation import written_names
+
+    return [PAGE, *written_names(estimators)]
+
+
+@contextmanager
+def compared(
     log: Path,
     output: Path,
     names: list[str],
@@ -183,18 +208,43 @@ def compare_log(
     recognition: RecogniserOptions,
     rate_hz: float,
     settings: list[str] | None,
-) -> Comparison:
-    """Read a log, recognise landmarks if it needs that, and compare estimators; mistakes are reported first."""
-    from sonar_graph.diagnosis import wrong_units
+    *,
+    overwrite: bool,
+) -> Iterator[Comparison]:
+    """Read a log, recognise landmarks if it needs that, and compare estimators; mistakes are reported first.
+
+    The folder for the results is kept from other commands until the block, which writes them, ends.
+    """
+    overrides = estimator_settings(settings, names)
+    check_requests(names, overrides)
+    sources = (log, reading.calibration, reading.log_config, recognition.designs, recognition.model)
+    pictures = [path.relative_to(output).as_posix() for path in output.glob("recognised/*.jpg") if path.stem.isdigit()]
+    with writable_folder(output, [*result_names(names), *pictures], sources, overwrite=overwrite):
+        yield compare_log(log, names, overrides, reading, recognition, rate_hz)
+
+
+def check_requests(names: list[str], overrides: dict[str, dict[str, Any]]) -> None:
+    """Raise for a name or setting that does not exist."""
     from sonar_graph.evaluation import check_request
+
+    for name in names:
+        check_request(name, overrides.get(name))
+
+
+def compare_log(
+    log: Path,
+    names: list[str],
+    overrides: dict[str, dict[str, Any]],
+    reading: ReadingOptions,
+    recognition: RecogniserOptions,
+    rate_hz: float,
+) -> Comparison:
+    """Read a log, recognise landmarks if it needs that, and compare estimators."""
+    from sonar_graph.diagnosis import wrong_units
     from sonar_graph.evaluation import compare as compare_runs
     from sonar_graph.logs.adapters import LogConfig
     from sonar_graph.recognition import no_images, with_detections
 
-    overrides = estimator_settings(settings, names)
-    for name in names:
-        check_request(name, overrides.get(name))
-    writable_folder(output, (log, reading.calibration, reading.log_config, recognition.designs, recognition.model))
     with progress_bars() as progress:
         sequence = reading.read(log, progress=partial(progress, f"reading {log.name}"))
     check_rate(rate_hz, sequence)
@@ -236,9 +286,9 @@ def print_outcome(comparison: Comparison, place: str) -> None:
     counterpart = published_counterpart(comparison)
     if counterpart is not None:
         out.print(counterpart)
-    typer.echo(place)
+    echo(place)
     failed = [run for run in comparison.runs if run.status == "failed"]
     for run in failed:
-        typer.echo(f"sonar-graph: {run.estimator} failed: {run.reason}", err=True)
+        echo(f"sonar-graph: {run.estimator} failed: {run.reason}", err=True)
     if failed:
         raise typer.Exit(1)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sonar_graph.cli.arguments import OutputLog, Overwrite, examples
+from sonar_graph.cli.arguments import OutputLog, Overwrite, echo, examples
 from sonar_graph.cli.outputs import progress_bars, working, writable_log
 
 if TYPE_CHECKING:
@@ -167,8 +167,8 @@ def _convert_file(
     with progress_bars() as progress:
         done = convert(source, path, lambda at, total: progress(f"converting {source.name}", at, total))
     for line in (f"{source.name}: {done.content}", *done.shortcomings(_MOST_LOSSES_SHOWN)):
-        typer.echo(line)
-    typer.echo(f"Log: {path}\nWhat is in it: sonar-graph inspect {path}")
+        echo(line)
+    echo(f"Log: {path}\nWhat is in it: sonar-graph inspect {path}")
 
 
 def _convert(read: Callable[[], Sequence], source: Path | None, output: Path, overwrite: bool) -> None:
@@ -179,4 +179,4 @@ def _convert(read: Callable[[], Sequence], source: Path | None, output: Path, ov
         sequence = read()
         write_log(path, sequence)
     detections = len(sequence.detections) if sequence.detections else 0
-    typer.echo(f"{sequence.name}: {sequence.duration_s:.1f} s, {detections} landmark detections\nLog: {path}")
+    echo(f"{sequence.name}: {sequence.duration_s:.1f} s, {detections} landmark detections\nLog: {path}")

@@ -9,7 +9,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from sonar_graph.cli.arguments import LogPath, ReadingOptions, answers, with_options
+from sonar_graph.cli.arguments import LogPath, ReadingOptions, answers, echo, with_options
 from sonar_graph.cli.outputs import working
 from sonar_graph.errors import SonarGraphError
 
@@ -41,7 +41,7 @@ def inspect(
     config, given = reading.config, reading.given
     summary = inspect_log(log, config, reading.choices, reading.window)
     if toml:
-        typer.echo(summary.toml, nl=False)
+        echo(summary.toml, nl=False)
         return
     findings: list[Finding] = []
     skipped = ""
@@ -64,7 +64,7 @@ def inspect(
     if as_json:
         content = asdict(summary) | {"path": str(summary.path), "duration_s": summary.duration_s}
         content |= {"obstacles": summary.obstacles, "sensors": [finding.plain() for finding in findings]}
-        typer.echo(strict_json(content | {"sensors_skipped": skipped}))
+        echo(strict_json(content | {"sensors_skipped": skipped}))
     else:
         print_summary(summary, findings, skipped)
 

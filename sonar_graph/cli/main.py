@@ -5,20 +5,22 @@ reference; 2 a mistake of the user, reported in one line on stderr; 130 interrup
 traceback.
 """
 
+import signal
 import sys
 from collections.abc import Sequence
 from typing import Annotated
 
 import typer
 
-from sonar_graph.cli.arguments import examples
-from sonar_graph.cli.bench import INTERRUPTED, benches
+from sonar_graph.cli.arguments import examples, printable
+from sonar_graph.cli.bench import benches
 from sonar_graph.cli.compare import compare, demo, estimators, report, run
 from sonar_graph.cli.convert_data import datasets
 from sonar_graph.cli.inspect_log import inspect
 from sonar_graph.cli.recognise import calibrate, recognise
 from sonar_graph.cli.simulate import worlds
 from sonar_graph.errors import SonarGraphError
+from sonar_graph.interrupts import INTERRUPTED, end_at_once, noticed_interrupts
 from sonar_graph.version import __version__
 
 MISTAKE = 2
@@ -80,22 +82,33 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command and exit with its code; the entry point of ``sonar-graph``."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        code = app(given or ["--help"], prog_name="sonar-graph", standalone_mode=False)
-    except (SonarGraphError, OSError) as error:
-        code = _complain(str(error), MISTAKE)
+        with noticed_interrupts() as check:
+            try:
+                code = _run(given)
+            finally:  # compiled code may have made another exception of Ctrl-C, or none
+                check()
     except KeyboardInterrupt:
         code = INTERRUPTED
-    except Exception as error:
-        if not hasattr(error, "format_message"):  # not typer's own: nobody foresaw it
-            raise
-        context = getattr(error, "ctx", None)
-        command = context.command_path if context else "sonar-graph"
-        code = _complain(f"{error.format_message().rstrip('.')}; see {command} --help", MISTAKE)
+    if arguments is None:
+        signal.signal(signal.SIGINT, end_at_once)
     if code == INTERRUPTED:  # typer turns Ctrl-C into this code without a word
         _complain("interrupted", INTERRUPTED)
     sys.exit(int(code or 0))
 
 
+def _run(given: list[str]) -> int | None:
+    try:
+        return app(given or ["--help"], prog_name="sonar-graph", standalone_mode=False)
+    except (SonarGraphError, OSError) as error:
+        return _complain(str(error), MISTAKE)
+    except Exception as error:
+        if not hasattr(error, "format_message"):  # not typer's own: nobody foresaw it
+            raise
+        context = getattr(error, "ctx", None)
+        command = context.command_path if context else "sonar-graph"
+        return _complain(f"{error.format_message().rstrip('.')}; see {command} --help", MISTAKE)
+
+
 def _complain(message: str, code: int) -> int:
-    print(f"sonar-graph: {' '.join(message.split())}", file=sys.stderr)
+    print(printable(f"sonar-graph: {' '.join(message.split())}"), file=sys.stderr)
     return code

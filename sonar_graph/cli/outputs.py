@@ -11,18 +11,9 @@ from tempfile import TemporaryFile
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from sonar_graph.cli.arguments import printable
 from sonar_graph.errors import EvaluationError, LogError, SonarGraphError
-
-_WRITTEN = (
-    "report.html",
-    "comparison.json",
-    "ensembles.json",
-    "sequence.npz",
-    "result.mcap",
-    "result.foxglove.json",
-    "result.rviz",
-)
-_WRITTEN_FOR_A_RUN = ("trajectory.tum", "causal.tum", "landmarks.csv", "result.json", "series.npz")
+from sonar_graph.files import result_folder
 
 
 def writable_log(path: Path, source: Path | None = None, *, overwrite: bool = False) -> Path:
@@ -55,25 +46,31 @@ def writable_json(path: Path, sources: Iterable[Path]) -> Path:
     return path
 
 
-def writable_folder(path: Path, sources: Iterable[Path | None] = ()) -> Path:
-    """Check that a comparison can be written to a folder, make it, and return ``path``.
+@contextmanager
+def writable_folder(
+    path: Path,
+    names: Iterable[str],
+    sources: Iterable[Path | None] = (),
+    *,
+    kind: str = "comparison",
+    overwrite: bool = False,
+) -> Iterator[Path]:
+    """Make a folder for results of some names and keep other commands out of it while the block runs.
 
-    Raises `EvaluationError` when it is a file, cannot be written to, or holds one of the sources under a name that is
-    written, or a ``result.mcap`` that this package did not write.
+    Raises `EvaluationError` when it is a file, cannot be written to, holds one of the sources under one of the names,
+    or files of these names that this package did not write, or another command writes there.
     """
     if path.exists() and not path.is_dir():
         raise EvaluationError(f"{path}: is a file; give a folder with -o")
-    names = [path / name for name in _WRITTEN]
-    names += [run / name for run in path.glob("runs/*") for name in _WRITTEN_FOR_A_RUN]
-    for written in filter(Path.exists, names):
+    for written in (path / name for name in names if (path / name).exists()):
         if any(source is not None and written.samefile(source) for source in sources):
             raise EvaluationError(
                 f"{written}: is what is read, and would be overwritten; choose another folder with -o"
             )
-        if written.suffix == ".mcap" and not _is_replaceable(written):
-            raise EvaluationError(f"{written}: exists, and sonar-graph did not write it; choose another folder with -o")
     _require_writing_in(path, path, EvaluationError)
-    return path
+    with result_folder(path, kind, overwrite=overwrite) as folder:
+        folder.require(names)
+        yield path
 
 
 def _is_part_of(path: Path, source: Path) -> bool:
@@ -87,7 +84,7 @@ def _is_replaceable(path: Path) -> bool:
     """True if there is no file, an empty one, or a log that this package wrote."""
     from sonar_graph.logs.mcap import is_own_log
 
-    return not path.exists() or path.stat().st_size == 0 or is_own_log(path)
+    return not path.exists() or (path.is_file() and (path.stat().st_size == 0 or is_own_log(path)))
 
 
 def _require_writing_in(folder: Path, path: Path, refusal: type[SonarGraphError]) -> None:
@@ -114,6 +111,7 @@ def progress_bars() -> Iterator[Report]:
     tasks = {}
 
     def show(what: str, done: int, total: int, remark: str = "") -> None:
+        what = printable(what)
         if what not in tasks:
             tasks[what] = bars.add_task(what, remark="")
         bars.update(tasks[what], completed=done, total=total or None, remark=remark)

@@ -17,6 +17,7 @@ from sonar_graph.cli.arguments import (
     Overwrite,
     ReadingOptions,
     answers,
+    echo,
     existing_file,
     nested_settings,
     validated,
@@ -24,6 +25,7 @@ from sonar_graph.cli.arguments import (
 )
 from sonar_graph.cli.outputs import progress_bars, working, writable_json, writable_log
 from sonar_graph.errors import LogError
+from sonar_graph.files import replacing
 
 if TYPE_CHECKING:
     from sonar_graph.calibration import Calibration
@@ -163,10 +165,10 @@ def recognise(
     if recognition.designs is None and recogniser == "designs":
         warn_of_other_designs(sequence)
     for topic, count in amended.replaced.items():
-        typer.echo(f"Replaced: {count} messages that the log had on {topic}")
+        echo(f"Replaced: {count} messages that the log had on {topic}")
     for note in amended.notes.values():
-        typer.echo(f"Not copied: {note}")
-    typer.echo(f"Log: {path}")
+        echo(f"Not copied: {note}")
+    echo(f"Log: {path}")
 
 
 @with_options("start", "end")
@@ -197,7 +199,8 @@ def calibrate(
             params=params,
             salvage=reading.salvage,
         )
-    path.write_text(measured.model_dump_json(indent=2) + "\n", encoding="utf-8")
+    with replacing(path) as partial:
+        partial.write_text(measured.model_dump_json(indent=2) + "\n", encoding="utf-8")
     few = []
     for name in (*(f"landmark {i}" for i in measured.ids), "no landmark"):
         frames, tracks = (measured.provenance[f"{what} of {name}"] for what in ("frames", "tracks"))
@@ -208,7 +211,7 @@ def calibrate(
             f"Caution: fewer than {FEW_TRACKS} tracks of {', '.join(few)}: frames of one track are alike; "
             "give more logs before the model is relied on"
         )
-    typer.echo(f"Model: {path}")
+    echo(f"Model: {path}")
 
 
 def recognise_log(

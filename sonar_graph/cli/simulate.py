@@ -12,6 +12,7 @@ from sonar_graph.cli.arguments import (
     OutputLog,
     Overwrite,
     ReadingOptions,
+    echo,
     examples,
     nested_settings,
     validated,
@@ -50,7 +51,7 @@ def landmarks(
         sequence = add_landmarks(reading.read(log), options)
         write_log(path, sequence)
     detections, placed = sequence.detections, sequence.true_landmarks
-    typer.echo(f"{len(placed or ())} landmarks, {len(detections or ())} detections\nLog: {path}")
+    echo(f"{len(placed or ())} landmarks, {len(detections or ())} detections\nLog: {path}")
 
 
 _OTHERS = (
@@ -126,8 +127,8 @@ def basin(
     if options.image is not None:
         placed = zip(designs_laid(options.image), LANDMARKS_XY_M.tolist(), strict=True)
         laid = ", ".join(f"{design.id} {design.name} at ({x:g}, {y:g})" for design, (x, y) in placed)
-        typer.echo(f"Landmarks: {laid}")
-    typer.echo(f"Log: {path}")
+        echo(f"Landmarks: {laid}")
+    echo(f"Log: {path}")
 
 
 def write_basin(path: Path, options: BasinOptions) -> None:

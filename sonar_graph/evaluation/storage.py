@@ -12,14 +12,15 @@
     DIR/runs/NAME/series.npz    everything as arrays, with covariances
     DIR/result.mcap             all of it for viewers, with layouts for Foxglove and RViz beside it
 
-Each file appears whole or not at all. ``comparison.json`` is removed first and written last: a folder that has one is
-complete. In npz files the fields of one object share a prefix: ``causal.stamps_ns``, ``causal.positions``, ...; an
+All files change together, when all are written (`sonar_graph.files`): those of an earlier comparison stay until then.
+In npz files the fields of one object share a prefix: ``causal.stamps_ns``, ``causal.positions``, ...; an
 absent object has no fields.
 """
 
 import io
 import json
 import zipfile
+from collections.abc import Iterable
 from dataclasses import MISSING, asdict, fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -30,11 +31,11 @@ from sonar_graph.calibration import Calibration
 from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation.metrics import rmse
 from sonar_graph.evaluation.results import Comparison, Ensemble, ErrorSeries, Kind, MapSoFar, RunResult, Score, gathered
-from sonar_graph.files import read_json, replacing, write_json
+from sonar_graph.files import read_json, replacing, result_written, write_json
 from sonar_graph.logs import Picture, write_landmarks_csv, write_result, write_tum
 from sonar_graph.logs.mcap import Attachment
 from sonar_graph.measurements import Dvl, Imu, LandmarkDetections
-from sonar_graph.recognition import read_recognition, write_recognition
+from sonar_graph.recognition import PICTURE_FOLDER, RECOGNITION, read_recognition, write_recognition
 from sonar_graph.sequence import Sequence
 from sonar_graph.settings import parse
 from sonar_graph.states import DetectionLog, LandmarkMap, Outcome, Refusal, RefusedRow, Trajectory
@@ -47,31 +48,39 @@ INDEX, SEQUENCE, RUNS = "comparison.json", "sequence.npz", "runs"
 RESULT, SERIES, RESULT_LOG = "result.json", "series.npz", "result.mcap"
 ENSEMBLES = "ensembles.json"
 ESTIMATES = ("trajectory.tum", "causal.tum", "landmarks.csv")
+COMPARISON = "comparison"
+"""Kind of result in the manifest of a folder."""
+
+
+def written_names(estimators: Iterable[str]) -> list[str]:
+    """Names that a comparison of these estimators may write; pictures are named by their stamps."""
+    of_runs = [f"{RUNS}/{name}/{file}" for name in estimators for file in (*ESTIMATES, SERIES, RESULT)]
+    layouts = ("result.foxglove.json", "result.rviz")
+    return [INDEX, SEQUENCE, ENSEMBLES, RECOGNITION, f"{PICTURE_FOLDER}/0.jpg", RESULT_LOG, *layouts, *of_runs]
 
 
 def write_comparison(comparison: Comparison, folder: Path) -> None:
     """Write a comparison into a folder, made where it does not exist.
 
-    Files of the same names are replaced. Files of an earlier comparison's other runs, and of a run that now failed, are
-    removed. Files of other kinds stay.
+    Files of an earlier comparison are replaced or removed, as far as they are as they were written; all others stay.
 
     Raises
     ------
     EvaluationError
-        When an estimator's name cannot be the name of a folder.
+        When an estimator's name cannot be the name of a folder; another command writes there; or a file would be
+        replaced that this package did not write.
     """
     names = [run.estimator for run in comparison.runs]
     for name in names:
         if name in ("", ".", "..") or any(character in name for character in '/\\:*?"<>|'):
             raise EvaluationError(f"estimator name {name!r} cannot name a folder; install it under another name")
-    (folder / RUNS).mkdir(parents=True, exist_ok=True)
-    (folder / INDEX).unlink(missing_ok=True)
-    for result in (folder / RUNS).glob(f"*/{RESULT}"):
-        if result.parent.name not in names:
-            for name in (*ESTIMATES, SERIES, RESULT):
-                (result.parent / name).unlink(missing_ok=True)
-            if not any(result.parent.iterdir()):
-                result.parent.rmdir()
+    with result_written(folder, COMPARISON) as written:
+        written.remove(name for name in written.names if name.startswith((f"{RUNS}/", f"{PICTURE_FOLDER}/")))
+        written.remove([INDEX, ENSEMBLES, RECOGNITION])
+        _write(comparison, folder)
+
+
+def _write(comparison: Comparison, folder: Path) -> None:
     sequence, ends = comparison.sequence, np.array([0, -1])  # all other rows of IMU and Doppler log are in the log
     arrays = _pack("imu", sequence.imu.rows(ends)) | _pack("dvl", sequence.dvl.rows(ends))
     arrays |= _pack("truth", sequence.truth) | _pack("true_landmarks", sequence.true_landmarks)
@@ -89,7 +98,6 @@ def write_comparison(comparison: Comparison, folder: Path) -> None:
             entry["errors"] = {kind: _error_summary(series) for kind, series in errors.items()}
         entries[run.estimator] = entry
     write_recognition(comparison.recognition, folder)
-    (folder / ENSEMBLES).unlink(missing_ok=True)
     if comparison.ensembles:
         write_json(folder / ENSEMBLES, {"ensembles": [asdict(one) for one in comparison.ensembles]})
     sequence, instants = comparison.sequence, comparison.instants_ns
@@ -110,16 +118,10 @@ def write_comparison(comparison: Comparison, folder: Path) -> None:
 
 def _write_run(run: RunResult, comparison: Comparison, folder: Path) -> None:
     """The files of one run: trajectories and map, all arrays, and ``result.json``."""
-    folder.mkdir(exist_ok=True)
-    for name in ESTIMATES:
-        (folder / name).unlink(missing_ok=True)
     if run.smoothed is not None and run.causal is not None and run.landmarks is not None:
-        with replacing(folder / "trajectory.tum") as path:
-            write_tum(path, run.smoothed)
-        with replacing(folder / "causal.tum") as path:
-            write_tum(path, run.causal)
-        with replacing(folder / "landmarks.csv") as path:
-            write_landmarks_csv(path, run.landmarks)
+        write_tum(folder / "trajectory.tum", run.smoothed)
+        write_tum(folder / "causal.tum", run.causal)
+        write_landmarks_csv(folder / "landmarks.csv", run.landmarks)
     _write_arrays(folder / SERIES, _run_arrays(run, comparison.errors.get(run.estimator, {})))
     scores = comparison.scores.get(run.estimator, {})
     timings = {key.removeprefix("time."): score.value for key, score in scores.items() if key.startswith("time.")}
@@ -179,11 +181,13 @@ def write_viewer_files(comparison: Comparison, folder: Path) -> None:
         for run in comparison.runs
     }
     names = [INDEX, *(f"{RUNS}/{run.estimator}/{RESULT}" for run in comparison.runs)]
-    attachments = [Attachment(name, "application/json", (folder / name).read_bytes()) for name in names]
     drawn = comparison.recognition.pictures if comparison.recognition else []
     pictures = [Picture(picture.stamp_ns, picture.jpeg) for picture in drawn]
     about = comparison.environment | settings
-    write_result(folder / RESULT_LOG, comparison.sequence, estimates, about, attachments, pictures)
+    with result_written(folder, COMPARISON) as written:
+        contents = {name: written.as_written(name).read_bytes() for name in names}
+        attachments = [Attachment(name, "application/json", content) for name, content in contents.items()]
+        write_result(folder / RESULT_LOG, comparison.sequence, estimates, about, attachments, pictures)
 
 
 def read_comparison(folder: Path) -> Comparison:

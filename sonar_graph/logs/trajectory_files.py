@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from sonar_graph.errors import LogError
+from sonar_graph.files import regular, replacing
 from sonar_graph.measurements import NS_PER_S
 from sonar_graph.states import LandmarkMap, Trajectory
 
@@ -57,7 +58,7 @@ def read_tum(path: Path) -> Trajectory:
     Raises `LogError` naming the line that is not a pose; or when the file cannot be read or its stamps do not increase.
     """
     try:
-        lines = Path(path).read_text(encoding="utf-8").splitlines()
+        lines = regular(Path(path)).read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise LogError(f"{path} cannot be read as a text file: {error}") from error
     stamps, poses = [], []
@@ -101,7 +102,7 @@ def read_landmarks_csv(path: Path) -> LandmarkMap:
     Raises `LogError` when the file cannot be read, or a column is missing or not a number.
     """
     try:
-        with Path(path).open(encoding="utf-8", newline="") as stream:
+        with regular(Path(path)).open(encoding="utf-8", newline="") as stream:
             rows = [[float(row[name]) for name in LANDMARK_COLUMNS] for row in csv.DictReader(stream)]
     except (OSError, KeyError, ValueError, TypeError) as error:
         raise LogError(f"{path} is not a landmark table with columns {','.join(LANDMARK_COLUMNS)}: {error}") from error
@@ -115,6 +116,7 @@ def read_landmarks_csv(path: Path) -> LandmarkMap:
 def _write(path: Path, text: str) -> None:
     try:
         Path(path).parent.mkdir(parents=True, exist_ok=True)
-        Path(path).write_text(text, encoding="utf-8")
+        with replacing(Path(path)) as partial:
+            partial.write_text(text, encoding="utf-8")
     except OSError as error:
         raise LogError(f"{path} cannot be written: {error.strerror}") from error

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration, Mounting, Start
 from sonar_graph.errors import CalibrationError, LogError
+from sonar_graph.files import regular
 from sonar_graph.logs.cdr import Bytes, Value, definition, encode, parse_definition, short_name
 from sonar_graph.logs.mcap import Keep, Recording, scan
 from sonar_graph.logs.roles import TF
@@ -130,11 +131,11 @@ class PartialCalibration:
         """
         kind = "JSON" if path.suffix == ".json" else "TOML"
         try:
-            text = path.read_text(encoding="utf-8")
+            text = regular(path).read_text(encoding="utf-8")
             values = json.loads(text) if kind == "JSON" else tomllib.loads(text)
         except OSError as error:
             raise CalibrationError(f"{path}: cannot be read: {error.strerror}") from error
-        except (json.JSONDecodeError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        except (ValueError, RecursionError) as error:
             raise CalibrationError(f"{path}: not {kind}: {error}") from error
         if not isinstance(values, dict):
             what = "expected an object with sections such as imu"
@@ -270,5 +271,5 @@ def with_notes(path: Path, notes: Mapping[str, str]) -> dict[str, str]:
 def _json(recording: Recording, key: str, text: str) -> object:
     try:
         return json.loads(text)
-    except json.JSONDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise LogError(f"{recording.path}: metadata record {METADATA!r}: {key} is not JSON: {error}") from error

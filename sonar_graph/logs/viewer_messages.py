@@ -25,6 +25,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from sonar_graph.errors import LogError
+from sonar_graph.files import replacing
 from sonar_graph.logs.adapters import body_to_ros
 from sonar_graph.logs.cdr import Value
 from sonar_graph.logs.mcap import Outgoing
@@ -255,7 +256,8 @@ def write_layouts(result: Path, layers: Sequence[Layer], scene: Scene) -> None:
     for suffix, text in ((FOXGLOVE_SUFFIX, layout), (RVIZ_SUFFIX, rviz_config(layers, scene))):
         path = result.with_suffix(suffix)
         try:
-            path.write_text(text, encoding="utf-8")
+            with replacing(path) as partial:
+                partial.write_text(text, encoding="utf-8")
         except OSError as error:
             raise LogError(f"{path} cannot be written: {error.strerror}") from error
 

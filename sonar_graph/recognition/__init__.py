@@ -3,13 +3,13 @@
 # fmt: off
 from sonar_graph.recognition.confusion_fit import calibrate
 from sonar_graph.recognition.recognition_record import (
-    SURE, DrawnFrame, Recognition, read_recognition, write_recognition,
+    PICTURE_FOLDER, RECOGNITION, SURE, DrawnFrame, Recognition, read_recognition, write_recognition,
 )
 from sonar_graph.recognition.session import (
     LandmarkRecogniser, no_images, recognise, recognise_images, with_detections,
 )
 
 __all__ = [
-    "DrawnFrame", "LandmarkRecogniser", "Recognition", "SURE", "calibrate", "no_images", "read_recognition",
-    "recognise", "recognise_images", "with_detections", "write_recognition",
+    "DrawnFrame", "LandmarkRecogniser", "PICTURE_FOLDER", "RECOGNITION", "Recognition", "SURE", "calibrate",
+    "no_images", "read_recognition", "recognise", "recognise_images", "with_detections", "write_recognition",
 ]

@@ -13,12 +13,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sonar_graph.files import read_json, write_json
+from sonar_graph.files import read_json, replacing, write_json
 from sonar_graph.measurements import LandmarkDetections
 from sonar_graph.sonar import Fan
 from sonar_graph.states import LandmarkMap
 
-RECOGNITION, PICTURES = "recognition.json", "recognised"
+RECOGNITION, PICTURE_FOLDER = "recognition.json", "recognised"
 MOST_SHOWN = 6
 NONE = -1
 LEAST_NAMED = 0.5
@@ -98,16 +98,13 @@ class Recognition:
 
 
 def write_recognition(recognition: Recognition | None, folder: Path) -> None:
-    """Write ``recognition.json`` and the pictures that the report shows; remove those of an earlier comparison."""
-    (folder / RECOGNITION).unlink(missing_ok=True)
-    for old in (folder / PICTURES).glob("*.jpg"):
-        old.unlink()
+    """Write ``recognition.json`` and the pictures that the report shows."""
     if recognition is None:
         return
-    (folder / PICTURES).mkdir(exist_ok=True)
     shown = recognition.shown()
     for picture in shown:
-        (folder / PICTURES / f"{picture.stamp_ns}.jpg").write_bytes(picture.jpeg)
+        with replacing(folder / PICTURE_FOLDER / f"{picture.stamp_ns}.jpg") as partial:
+            partial.write_bytes(picture.jpeg)
     pictures = [[p.stamp_ns, p.landmark_ids, p.probabilities] for p in shown]
     write_json(folder / RECOGNITION, recognition.entry() | {"pictures": pictures})
 
@@ -118,7 +115,7 @@ def read_recognition(folder: Path) -> Recognition | None:
         return None
     entry: dict[str, Any] = read_json(folder / RECOGNITION)
     pictures = [
-        DrawnFrame(stamp, (folder / PICTURES / f"{stamp}.jpg").read_bytes(), tuple(ids), tuple(probabilities))
+        DrawnFrame(stamp, (folder / PICTURE_FOLDER / f"{stamp}.jpg").read_bytes(), tuple(ids), tuple(probabilities))
         for stamp, ids, probabilities in entry["pictures"]
     ]
     warnings = [(stamp, reason) for stamp, reason in entry["warnings"]]

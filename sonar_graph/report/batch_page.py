@@ -4,9 +4,9 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from sonar_graph.batch import LEAST_PAIRS, RESULTS, RecordedBatch, metrics_of
+from sonar_graph.batch import BATCH, LEAST_PAIRS, RESULTS, RecordedBatch, metrics_of
 from sonar_graph.evaluation import ESTIMATES
-from sonar_graph.files import replacing
+from sonar_graph.files import replacing, result_written
 from sonar_graph.report import batch_figures as figures
 from sonar_graph.report import batch_summary as summary
 from sonar_graph.report import batch_tables as tables
@@ -23,17 +23,20 @@ ORIGINS = (
 """Columns of the results that are normally the same for all runs."""
 
 
-def write_batch_report(batch: RecordedBatch, folder: Path) -> Path:
+def write_batch_report(batch: RecordedBatch, folder: Path, *, overwrite: bool = False) -> Path:
     """Write ``report.html``, and each table as CSV and LaTeX into ``tables/``, from the results alone.
+
+    Files that this package did not write are replaced only with ``overwrite``.
 
     Returns
     -------
     Path of the page.
     """
     content = _content(batch)
-    write_tables(content["tables"], folder)
-    with replacing(folder / PAGE) as partial:
-        partial.write_text(render(TEMPLATE, content), "utf-8")
+    with result_written(folder, BATCH, overwrite=overwrite):
+        write_tables(content["tables"], folder)
+        with replacing(folder / PAGE) as partial:
+            partial.write_text(render(TEMPLATE, content), "utf-8")
     return folder / PAGE
 
 

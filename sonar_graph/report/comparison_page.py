@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation import (
     ABSENT,
+    COMPARISON,
     DURATION_S,
     MAP_TIMES_S,
     NONE,
@@ -36,7 +37,7 @@ from sonar_graph.evaluation import (
     write_comparison,
     write_viewer_files,
 )
-from sonar_graph.files import replacing
+from sonar_graph.files import replacing, result_written
 from sonar_graph.logs import PICTURES
 from sonar_graph.recognition import SURE
 from sonar_graph.report import figures, sentences
@@ -58,12 +59,12 @@ RUN_FILES = {
 """Files of a run, and the field of `RunResult` without which a file is absent."""
 
 
-def write_report(comparison: Comparison, folder: str | Path) -> Path:
+def write_report(comparison: Comparison, folder: str | Path, *, overwrite: bool = False) -> Path:
     """Write a comparison into a folder: all the files that ``sonar-graph compare`` writes.
 
     The folder is made where it does not exist. It gets ``report.html``, ``comparison.json``, ``sequence.npz``,
     ``runs/NAME/`` for each estimator, the pictures of recognised landmarks, and ``result.mcap`` with its layouts for
-    Foxglove and RViz. An earlier comparison in the folder is replaced; other files stay.
+    Foxglove and RViz. An earlier comparison in the folder is replaced when the new one is complete; other files stay.
 
     Parameters
     ----------
@@ -71,6 +72,8 @@ def write_report(comparison: Comparison, folder: str | Path) -> Path:
         Result of `sonar_graph.evaluation.compare`.
     folder
         Path of the folder.
+    overwrite
+        Replace files of these names also where this package did not write them, or they were changed since.
 
     Returns
     -------
@@ -79,7 +82,8 @@ def write_report(comparison: Comparison, folder: str | Path) -> Path:
     Raises
     ------
     EvaluationError
-        When the folder cannot be written to, or the name of an estimator cannot be the name of a folder.
+        When the folder cannot be written to, another command writes there, it holds others' files under these names, or
+        the name of an estimator cannot be the name of a folder.
     LogError
         When ``result.mcap`` cannot be written, or a stamp does not fit into a ROS 2 message.
 
@@ -96,9 +100,10 @@ def write_report(comparison: Comparison, folder: str | Path) -> Path:
     """
     folder = Path(folder)
     try:
-        write_comparison(comparison, folder)
-        write_viewer_files(comparison, folder)
-        return write_page(comparison, folder)
+        with result_written(folder, COMPARISON, overwrite=overwrite):
+            write_comparison(comparison, folder)
+            write_viewer_files(comparison, folder)
+            return write_page(comparison, folder)
     except OSError as error:
         raise EvaluationError(f"{folder}: cannot be written: {error.strerror}; choose another folder") from error
 
@@ -109,7 +114,7 @@ def write_page(comparison: Comparison, folder: Path) -> Path:
     The page needs nothing but itself: figures are inline SVG in the page's colours, style is inline, there is no
     script. Links lead to the files beside it (``comparison.json``, ``result.mcap``, ``runs/NAME/``).
     """
-    with replacing(folder / PAGE) as partial:
+    with result_written(folder, COMPARISON), replacing(folder / PAGE) as partial:
         partial.write_text(render_report(comparison), encoding="utf-8")
     return folder / PAGE
 

@@ -66,7 +66,6 @@ def data_address(text: str | bytes, kind: str) -> str:
 def write_tables(tables: list[Table], folder: Path) -> list[Path]:
     """Write each table as ``tables/NAME.csv`` and ``tables/NAME.tex`` in a folder; earlier ones are replaced."""
     written = []
-    (folder / FOLDER).mkdir(parents=True, exist_ok=True)
     for table in tables:
         for suffix, text in (("csv", as_csv(table)), ("tex", as_latex(table))):
             path = folder / FOLDER / f"{table.name}.{suffix}"
@@ -92,10 +91,21 @@ def as_csv(table: Table) -> str:
 
 
 def csv_text(rows: list[list[str]]) -> str:
-    """Rows of texts as CSV (RFC 4180, with line feeds alone)."""
+    """Rows of texts as CSV (RFC 4180, with line feeds alone), without formulas for spreadsheets."""
     buffer = io.StringIO()
-    csv.writer(buffer, lineterminator="\n").writerows(rows)
+    csv.writer(buffer, lineterminator="\n").writerows([map(_plain_cell, row) for row in rows])
     return buffer.getvalue()
+
+
+def _plain_cell(text: str) -> str:
+    """A cell that no spreadsheet calculates: what could be a formula gets an apostrophe; numbers stay."""
+    if not text.startswith(("=", "+", "-", "@", "\t", "\r")):
+        return text
+    try:
+        float(text)
+    except ValueError:
+        return f"'{text}"
+    return text
 
 
 def as_latex(table: Table) -> str:

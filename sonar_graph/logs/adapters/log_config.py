@@ -22,6 +22,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from sonar_graph.errors import LogError
+from sonar_graph.files import regular
 from sonar_graph.logs.adapters.adapter import Adapter, leaf_fields
 from sonar_graph.logs.adapters.aiding_messages import HeadingAdapter, PositionAdapter
 from sonar_graph.logs.adapters.drivers import SHIPPED
@@ -172,10 +173,10 @@ def read_log_config(path: Path) -> LogConfig:
     A LogError where it cannot be read, is not TOML, or says something that cannot be; it names table and key.
     """
     try:
-        values = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        values = tomllib.loads(regular(Path(path)).read_text(encoding="utf-8"))
     except OSError as error:
         raise LogError(f"{path} cannot be read: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise LogError(f"{path}: not TOML: {error}") from error
     return LogConfig.parse(values, str(path))
 

@@ -184,9 +184,12 @@ PRIMITIVES = {
 STRING = "string"
 _MOST_FIELDS = 10_000
 _DEEPEST = 50
-_SECTION = re.compile(r"^=+\s*\n\s*MSG:\s*(\S+)\s*\n", re.MULTILINE)
+_SHOWN = 80
+"""Characters of a faulty line in an error."""
+_LONGEST_TEXT = 1 << 20
+_SECTION = re.compile(r"^=+\n[ \t]*MSG:[ \t]*(\S+)\n", re.MULTILINE)
 _FIELD = re.compile(
-    r"^(?P<type>[\w/]+)(?:<=\d+)?(?P<array>\[(?P<length>(?:<=)?\d*)\])?\s+(?P<name>[A-Za-z]\w*)\s*(?P<rest>.*)$"
+    r"^(?P<type>[\w/]+)(?:<=\d+)?(?P<array>\[(?P<length>(?:<=)?\d{0,9})\])?\s+(?P<name>[A-Za-z]\w*)\s*(?P<rest>.*)$"
 )
 
 
@@ -211,18 +214,31 @@ class Field:
     """True for an array or sequence."""
 
 
-@lru_cache(maxsize=256)
 def parse_definition(type_name: str, text: str) -> Struct:
     """Tree of a message type, such as ``sensor_msgs/msg/Imu``, from its ``ros2msg`` text with all dependencies.
 
     Relative type names in the text belong to the package of the type. A LogError names the line that is not a field, or
     the type whose definition is not in the text.
     """
-    own, *rest = _SECTION.split(text.replace("\r\n", "\n"))
+    found = _parsed(type_name, text)
+    if isinstance(found, str):
+        raise LogError(found)
+    return found
+
+
+@lru_cache(maxsize=256)
+def _parsed(type_name: str, text: str) -> Struct | str:
+    """Tree of a message type, or the fault of its text; both are remembered, since every role asks."""
+    if len(text) > _LONGEST_TEXT:
+        return f"the definition of {type_name} has {len(text)} characters, and at most {_LONGEST_TEXT} are read"
+    own, *rest = _SECTION.split("\n".join(stripped for line in text.splitlines() if (stripped := line.rstrip())) + "\n")
     texts = {short_name(name): body for name, body in zip(rest[::2], rest[1::2], strict=True)}
     root = short_name(type_name)
     texts[root] = own
-    return _Parser(texts).struct(root, ())
+    try:
+        return _Parser(texts).struct(root, ())
+    except LogError as error:
+        return str(error)
 
 
 class _Parser:
@@ -245,7 +261,7 @@ class _Parser:
         for line in (line.split("#", 1)[0].strip() for line in self._texts[name].splitlines()):
             match = _FIELD.match(line)
             if line and (match is None or match["length"] == "0"):
-                raise LogError(f"the definition of {name} has the line {line!r}, which is no ros2msg field")
+                raise LogError(f"the definition of {name} has the line {line[:_SHOWN]!r}, which is no ros2msg field")
             if match is None or match["rest"].startswith("="):  # an empty line, a constant
                 continue
             kind = self._kind(match["type"], name, users)
@@ -253,6 +269,8 @@ class _Parser:
             if match["name"] in fields:
                 raise LogError(f"the definition of {name} has two fields called {match['name']}")
             fields[match["name"]] = Field(match["name"], kind, length, is_array=match["array"] is not None)
+            if len(fields) > _MOST_FIELDS:
+                break
         struct = self._done[name] = Struct(name, tuple(fields.values()))
         self._sizes[name] = sum(
             self._sizes[entry.kind.name] if isinstance(entry.kind, Struct) else 1 for entry in struct.fields

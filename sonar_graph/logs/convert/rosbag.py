@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 from mcap.writer import Writer
 
 from sonar_graph.errors import LogError
-from sonar_graph.files import written_whole
+from sonar_graph.files import regular, written_whole
 from sonar_graph.logs.mcap import LIBRARY, ROSBAG2_METADATA, START_BYTES, TRANSIENT_LOCAL, Progress, why_no_bag
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ def _open_bag(source: Path) -> Iterator[AnyReader]:
     except ImportError as error:
         raise LogError(f"{source}: bags are read by the rosbags library, which is not installed: {_INSTALL}") from error
     if source.is_file():
-        with source.open("rb") as stream:
+        with regular(source).open("rb") as stream:
             fault = why_no_bag(source, stream.read(START_BYTES))
         if fault is not None:
             raise LogError(f"{source} is {fault}")

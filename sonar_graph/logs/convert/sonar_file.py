@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from sonar_graph.calibration import Calibration, SonarCalibration, SonarImage
 from sonar_graph.errors import DatasetError
+from sonar_graph.files import regular
 from sonar_graph.images import SonarFrames
 from sonar_graph.logs.mcap import Progress, recording
 from sonar_graph.logs.vehicle_setup import METADATA, recorded_calibration
@@ -141,7 +142,7 @@ class ByteSource:
     def __init__(self, path: Path) -> None:
         self.path = path
         try:
-            self._stream = path.open("rb")
+            self._stream = regular(path).open("rb")
             self.size = path.stat().st_size
         except OSError as error:
             raise DatasetError(f"{path}: cannot be read: {error.strerror}") from error

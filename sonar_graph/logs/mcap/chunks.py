@@ -18,12 +18,10 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs.mcap.records import HEAD, LOOSE, ChunkRecord
+from sonar_graph.logs.mcap.records import HEAD, LARGEST_BYTES, LOOSE, SMALLER_CHUNKS, ChunkRecord
 from sonar_graph.measurements import Ints
 
-LARGEST_BYTES = 1 << 32
-"""Limit for decompressing a chunk; a damaged size could ask for all memory."""
-_PIECE = 1 << 13
+_PIECE = 1 << 10
 _ZSTD, _LZ4 = b"\x28\xb5\x2f\xfd", b"\x04\x22\x4d\x18"
 _MESSAGE = np.dtype(
     [("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8"), ("publish", "<u8")]
@@ -91,12 +89,14 @@ def unpack(chunk: ChunkRecord, packed: bytes) -> bytes:
         if chunk.compression == "zstd" or (chunk.compression not in ("", "lz4") and packed.startswith(_ZSTD)):
             size = zstandard.get_frame_parameters(packed).content_size
             unknown = size in (zstandard.CONTENTSIZE_UNKNOWN, zstandard.CONTENTSIZE_ERROR)
-            size = chunk.uncompressed_size if unknown else size
-            if size > LARGEST_BYTES:
-                raise ChunkError(f"it claims to have {size} bytes")
-            data = _DECOMPRESSOR.decompress(packed, max_output_size=size)
+            data = _DECOMPRESSOR.decompress(
+                packed, max_output_size=_limited(chunk.uncompressed_size if unknown else size)
+            )
         elif chunk.compression == "lz4" or (chunk.compression and packed.startswith(_LZ4)):
-            data = lz4.frame.decompress(packed)
+            frame = lz4.frame.LZ4FrameDecompressor()
+            data = frame.decompress(packed, max_length=_limited(chunk.uncompressed_size) + 1)
+            if not frame.eof:
+                raise ChunkError(f"it has another size than the {chunk.uncompressed_size} bytes that it states")
         elif chunk.compression:
             raise ChunkError(f"its compression {chunk.compression!r} is not known")
     except (zstandard.ZstdError, RuntimeError, MemoryError, ValueError) as error:
@@ -106,6 +106,15 @@ def unpack(chunk: ChunkRecord, packed: bytes) -> bytes:
     if not chunk.crc and len(data) != chunk.uncompressed_size:
         raise ChunkError(f"it has {len(data)} bytes instead of {chunk.uncompressed_size}")
     return data
+
+
+def _limited(size: int) -> int:
+    """Bytes of a chunk as its head states them; a ChunkError where they are more than fit into memory."""
+    if size > LARGEST_BYTES:
+        raise ChunkError(
+            f"it claims to have {size} bytes, and at most {LARGEST_BYTES} are read at once; {SMALLER_CHUNKS}"
+        )
+    return size
 
 
 def unpack_beginning(chunk: ChunkRecord, packed: bytes) -> bytes:
@@ -119,7 +128,7 @@ def unpack_beginning(chunk: ChunkRecord, packed: bytes) -> bytes:
     try:
         for at in range(0, len(packed), _PIECE):
             found += reader.decompress(packed[at : at + _PIECE])
-            if len(found) > LARGEST_BYTES:
+            if len(found) > min(chunk.uncompressed_size, LARGEST_BYTES):
                 break
     except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError):
         pass  # what came before is whole

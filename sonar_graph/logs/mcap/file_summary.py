@@ -19,12 +19,14 @@ from mcap.records import Channel, ChunkIndex, Schema, Statistics
 
 from sonar_graph.errors import LogError
 from sonar_graph.logs.mcap.chunks import find_by_walk
-from sonar_graph.logs.mcap.records import HEAD, MAGIC, ByteRange, ChunkRecord, LogFile, RecordWalk
+from sonar_graph.logs.mcap.records import HEAD, LARGEST_BYTES, MAGIC, ByteRange, ChunkRecord, LogFile, RecordWalk
 
 _FOOTER = struct.Struct("<BQQQI")
 _DATA_END = struct.Struct("<BQI")
 _DATA_END_HEAD = HEAD.pack(Opcode.DATA_END, 4)
 _LARGEST_MOVED = 1 << 26
+_MOST_ENDS = 8
+"""Ends of the data that are tried: the right one is the last, unless the summary has its nine bytes by chance."""
 T = TypeVar("T", bound=Any)
 
 
@@ -74,19 +76,23 @@ def read_summary(file: LogFile) -> tuple[FileSummary | None, str | None]:
     least = len(MAGIC) + _DATA_END.size
     if opcode != Opcode.FOOTER or length != _FOOTER.size - HEAD.size or not least <= start <= footer_at:
         return None, "its footer is damaged"
+    if footer_at - start > LARGEST_BYTES:
+        return None, f"its summary is said to have {footer_at - start} bytes, and at most {LARGEST_BYTES} are read"
     if not crc or _crc(file, start, footer_at) == crc:
         return _read(file, start, footer_at, has_crc=crc != 0)
     first = max(footer_at - _LARGEST_MOVED, 0)
     content = file.read(first, footer_at - first)
-    at = content.rfind(_DATA_END_HEAD)
-    while at >= 0:
+    at = len(content)
+    for _ in range(_MOST_ENDS):
+        at = content.rfind(_DATA_END_HEAD, 0, at)
+        if at < 0:
+            break
         moved = first + at + _DATA_END.size
         if _crc(file, moved, footer_at) == crc:
             summary, _ = _read(file, moved, footer_at, has_crc=True)
             if summary:
                 summary.chunks.clear()
             return summary, "bytes are missing or doubled in it, so that its index does not fit"
-        at = content.rfind(_DATA_END_HEAD, 0, at)
     return None, "its summary is damaged: the CRC does not fit"
 
 

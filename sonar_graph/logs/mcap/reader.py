@@ -18,7 +18,6 @@ from mcap.records import ChunkIndex, Metadata
 
 from sonar_graph.errors import LogError
 from sonar_graph.logs.mcap.chunks import (
-    ChunkError,
     Content,
     Found,
     Index,
@@ -28,12 +27,24 @@ from sonar_graph.logs.mcap.chunks import (
     unpack_beginning,
 )
 from sonar_graph.logs.mcap.file_summary import TimeWindow, first_time_ns, parse, read_summary
-from sonar_graph.logs.mcap.records import PRIVATE, ByteRange, ChunkRecord, Hole, LogFile, Record, RecordWalk, open_seal
+from sonar_graph.logs.mcap.records import (
+    LARGEST_BYTES,
+    PRIVATE,
+    ByteRange,
+    ChunkRecord,
+    Hole,
+    LogFile,
+    Record,
+    RecordWalk,
+    open_seal,
+)
 from sonar_graph.logs.mcap.topic import Damage, Descriptions, Keep, Loss, Topic, settle
 
 _BLOCK = 1 << 22
 _NS_PER_S = 1_000_000_000
 _PIECE_BYTES = 1 << 20
+_LARGEST_RATIO = 64
+"""Bytes of messages for each byte of a log; samples of an IMU at rest, each with its stamp, compress by some thirty."""
 Progress = Callable[[int, int], None]
 """Function called with the bytes done and the bytes in all."""
 
@@ -156,7 +167,7 @@ class Passage:
         """Messages of a chunk; returns True where the chunk is lost, together with a hole after it."""
         try:
             data = unpack(chunk, self._file.read(chunk.data_at, chunk.data_size))
-        except ChunkError as error:
+        except LogError as error:
             reason = f"chunk {self.chunks} is lost: {error}"
             # before a hole the chunk may have a wrong length: the next record is searched from its beginning
             end = self._walk.search(chunk.at).end if before_hole else chunk.end
@@ -386,13 +397,11 @@ def scan(
     with LogFile(path) as file:
         passage = Passage(file, keep, window, progress=progress)
         try:
-            for piece in passage:
-                piece.topic.gather(piece.data, *piece.found)
+            _gather_all(passage, file)
         except IndexMismatchError:
             remarks = passage.damage.remarks
             passage = Passage(file, keep, window, may_skip=False, progress=progress)
-            for piece in passage:
-                piece.topic.gather(piece.data, *piece.found)
+            _gather_all(passage, file)
             passage.damage.remarks[:0] = remarks
     counts = passage.counts
     topics = {
@@ -414,6 +423,20 @@ def scan(
         passage.skipped,
         passage.part,
     )
+
+
+def _gather_all(passage: Passage, file: LogFile) -> None:
+    """Gather the wanted messages by topic; a LogError where they are more than a log of this size can honestly hold."""
+    held, most = 0, max(LARGEST_BYTES, file.size * _LARGEST_RATIO)
+    for piece in passage:
+        before = piece.topic.held_bytes
+        piece.topic.gather(piece.data, *piece.found)
+        held += piece.topic.held_bytes - before
+        if held > most:
+            raise LogError(
+                f"{file.path}: its {file.size} bytes unpack to more than {most} bytes of messages, as no sensor's do; "
+                "read a part with --start and --end, or leave the topic out with `mcap filter`"
+            )
 
 
 def stream(

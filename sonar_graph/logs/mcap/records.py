@@ -19,6 +19,7 @@ import numpy as np
 from mcap.opcode import Opcode
 
 from sonar_graph.errors import LogError
+from sonar_graph.files import regular
 
 MAGIC = b"\x89MCAP0\r\n"
 BAG_MAGIC = (b"#ROSBAG", b"SQLite format 3")
@@ -58,6 +59,9 @@ def _unknown_kind(start: bytes, advice: str) -> str:
 
 
 HEAD = struct.Struct("<BQ")
+LARGEST_BYTES = 1 << 28
+"""Most bytes of one record, and of a chunk without compression; a stated size could ask for all memory."""
+SMALLER_CHUNKS = "`mcap compress LOG -o OUT.mcap --chunk-size 4194304` writes smaller chunks"
 LOOSE = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
 """Kinds of records within chunks; outside where the writer makes no chunks."""
 _TIMES_SIZE_CRC = struct.Struct("<QQQII")
@@ -136,7 +140,7 @@ class LogFile:
         if path.is_dir():
             raise LogError(f"{path} is a folder; give the .mcap file in it")
         try:
-            self._stream = path.open("rb", buffering=1 << 16)
+            self._stream = regular(path).open("rb", buffering=1 << 16)
         except OSError as error:
             raise LogError(f"{path} cannot be read: {error.strerror}") from error
         self.path = path
@@ -153,11 +157,20 @@ class LogFile:
         self._stream.close()
 
     def read(self, at: int, count: int) -> bytes:
-        """Bytes from an offset on; fewer than asked for at the end of the file."""
+        """Bytes from an offset on; fewer than asked for at the end of the file.
+
+        A LogError where they are more than `LARGEST_BYTES`.
+        """
         if at >= self.size:  # a damaged length may point anywhere
             return b""
+        count = min(count, self.size - at)
+        if count > LARGEST_BYTES:
+            raise LogError(
+                f"{self.path}: bytes {at} to {at + count} are one record, and at most {LARGEST_BYTES} are read at "
+                f"once; {SMALLER_CHUNKS}"
+            )
         self._stream.seek(at)
-        return self._stream.read(min(count, self.size - at))
+        return self._stream.read(count)
 
     def content(self, record: Record) -> bytes:
         """Content of a record."""

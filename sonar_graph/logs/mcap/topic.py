@@ -244,7 +244,8 @@ class Descriptions:
         self.by_name: dict[str, Topic] = {}
         self.as_written: dict[str, tuple[Channel, Schema]] = {}
         """Channel and schema of each topic, byte by byte."""
-        self.remarks: list[str] = []
+        self.remarks: dict[str, None] = {}
+        """Texts in their order."""
 
     def add_summary(self, summary: FileSummary) -> None:
         """Add the copies in the summary."""
@@ -290,6 +291,5 @@ class Descriptions:
         if old is not None and old != new:
             which = "the one under a CRC holds" if is_covered or was_covered else "the first holds"
             remark = f"{what} ({getattr(old, name)}) is described in two ways; {which}"
-            if remark not in self.remarks:
-                self.remarks.append(remark)
+            self.remarks[remark] = None
         return holds

@@ -21,7 +21,7 @@ from typing import BinaryIO
 import numpy as np
 from mcap.writer import Writer
 
-from sonar_graph.files import written_whole
+from sonar_graph.files import regular, written_whole
 from sonar_graph.logs.cdr import Bytes, definition
 from sonar_graph.logs.mcap.records import MAGIC, seal
 from sonar_graph.measurements import Ints
@@ -103,7 +103,7 @@ def recording(path: Path, metadata: Mapping[str, Mapping[str, str]]) -> Iterator
 
 def is_own_log(path: Path) -> bool:
     """True for a log that this package wrote, of whatever profile, by the header of the file."""
-    with path.open("rb") as stream:
+    with regular(path).open("rb") as stream:
         if stream.read(len(MAGIC)) != MAGIC:
             return False
         stream.seek(_HEAD_AT)

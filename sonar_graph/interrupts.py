@@ -1,0 +1,103 @@
+"""Ctrl-C and SIGTERM: noticed where compiled code swallows them, deferred while files change, and told in one line."""
+
+import contextlib
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+INTERRUPTED = 130
+"""Exit code of a command that Ctrl-C ended."""
+_Signal = tuple[int, FrameType | None]
+
+
+@contextmanager
+def _handling(handle: Callable[[_Signal, Callable[[], object]], object]) -> Iterator[bool]:
+    """Give each Ctrl-C of the block to ``handle``, with what would have been done; False where that is not possible.
+
+    Only the main thread has handlers, and one of another program's C code stays.
+    """
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(before):
+        yield False
+        return
+    usual: Callable[[int, FrameType | None], object] = before
+    signal.signal(signal.SIGINT, lambda number, frame: handle((number, frame), lambda: usual(number, frame)))
+    try:
+        yield True
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def noticed_interrupts() -> Iterator[Callable[[], None]]:
+    """Give a function that raises `KeyboardInterrupt` if Ctrl-C came during the block.
+
+    Compiled code may turn the exception into another, or swallow it, and its caller would go on or name a failure.
+    """
+    came: list[_Signal] = []
+
+    def notice(signalled: _Signal, usual: Callable[[], object]) -> None:
+        came.append(signalled)
+        usual()
+
+    def check() -> None:
+        if came:
+            raise KeyboardInterrupt
+
+    with _handling(notice):
+        yield check
+
+
+@contextmanager
+def deferred_interrupt() -> Iterator[None]:
+    """Defer a Ctrl-C that comes during the block to its end.
+
+    Compiled code that cannot raise (some of pyarrow) swallows the exception, and files would be half replaced.
+
+    Raises `KeyboardInterrupt` at the end of the block, when the signal came in between; an error of the block is its
+    context.
+    """
+    came: list[Callable[[], object]] = []
+    try:
+        with _handling(lambda _, usual: came.append(usual)):
+            yield
+    finally:
+        if came:  # also when the block fails: a caller that passes over its error must not pass over the interrupt
+            came[0]()
+
+
+@contextmanager
+def terminations_as_interrupts() -> Iterator[None]:
+    """Treat SIGTERM, by which SLURM, Kubernetes and ``timeout`` end a job, like Ctrl-C inside the block."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        handler = signal.getsignal(signal.SIGINT)
+        (handler if callable(handler) else signal.default_int_handler)(number, frame)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def end_at_once(*_: object) -> None:
+    """End the process as interrupted: a handler for when it begins and ends, which is no place for a traceback."""
+    with contextlib.suppress(Exception):
+        sys.stdout.flush()
+    os.write(2, b"sonar-graph: interrupted\n")
+    os._exit(INTERRUPTED)
+
+
+@contextmanager
+def loading() -> Iterator[None]:
+    """End the process at a Ctrl-C within the block, while modules are imported."""
+    with _handling(end_at_once):
+        yield
