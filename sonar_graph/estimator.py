@@ -20,6 +20,8 @@ from sonar_graph.settings import nested, parse, suggestion
 from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, RefusedRow, Trajectory
 
 ENTRY_POINT_GROUP = "sonar_graph.estimators"
+DISTRIBUTION = "sonar-graph"
+"""Name of this package among those that are installed."""
 
 
 @runtime_checkable
@@ -106,6 +108,12 @@ def installed_estimators() -> dict[str, EntryPoint]:
     return dict(sorted(found.items()))
 
 
+def is_foreign(name: str) -> bool:
+    """Tell whether another package brings an estimator, whose code may change the process that loads it."""
+    point = installed_estimators().get(name)
+    return point is not None and point.dist is not None and point.dist.name != DISTRIBUTION
+
+
 def load_estimator(name: str) -> type[Estimator]:
     """Class of an installed estimator.
 
@@ -137,8 +145,9 @@ def load_estimator(name: str) -> type[Estimator]:
         raise UnknownEstimatorError(f"no estimator is called {name!r}{suggestion(name, installed)} installed: {known}")
     try:
         loaded: Any = installed[name].load()
-    except Exception as error:  # a third party's import may fail in any way
-        raise EstimatorError(f"{name} ({installed[name].value}) cannot be loaded: {error}") from error
+    except (Exception, SystemExit) as error:  # a third party's import may fail in any way
+        said = f"it calls sys.exit({error})" if isinstance(error, SystemExit) else str(error)
+        raise EstimatorError(f"{name} ({installed[name].value}) cannot be loaded: {said}") from error
     missing = [m for m in ("Params", "process", "trajectory", "landmarks", "detections") if not hasattr(loaded, m)]
     if missing:
         raise EstimatorError(f"{name} ({installed[name].value}) lacks {', '.join(missing)} of the estimator contract")

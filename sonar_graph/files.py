@@ -23,6 +23,8 @@ from sonar_graph.errors import EvaluationError, LogError, SonarGraphError
 from sonar_graph.interrupts import deferred_interrupt
 
 MANIFEST, LOCK = ".sonar_graph.json", ".lock"
+COMPARISON, BATCH = "comparison", "batch"
+"""Kinds of results in the manifests of folders."""
 FORMAT = "sonar_graph folder 1"
 DIGEST_DIGITS = 32
 _NAMED = 4
@@ -85,7 +87,9 @@ class ResultFolder:
         if others:
             told = ", ".join(others[:_NAMED]) + (f" and {len(others) - _NAMED} more" if len(others) > _NAMED else "")
             advice = "choose another folder with -o" + ("" if links else ", or give --overwrite to replace this")
-            raise self._refusal(f"{self.path}: holds {told}, which sonar-graph did not write or others changed since; {advice}")
+            raise self._refusal(
+                f"{self.path}: holds {told}, which sonar-graph did not write or others changed since; {advice}"
+            )
 
     def _is_linked(self, name: str) -> bool:
         """Tell whether a folder on the way to a file is a link, or the file is a folder."""
@@ -158,8 +162,8 @@ def result_folder(
 ) -> Iterator[ResultFolder]:
     """Make a folder and keep every other command out of it while the block runs.
 
-    Within the block the folder is the same wherever this thread asks for it; ``overwrite`` of the outermost holds. The
-    operating system releases the lock when the process ends, also by SIGKILL; the file that stays means nothing.
+    `result_written` of the same thread writes to it; ``overwrite`` of this block holds. The operating system releases
+    the lock when the process ends, also by SIGKILL; the file that stays means nothing.
 
     Raises
     ------
@@ -169,16 +173,15 @@ def result_folder(
         When the folder cannot be made.
     """
     place = path.absolute(), threading.get_ident()
-    if place in _held:
-        yield _held[place]
-        return
     path.mkdir(parents=True, exist_ok=True)
     flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
     descriptor = os.open(path / LOCK, flags, 0o666)
     try:
         try:
             _lock(descriptor)
-        except (BlockingIOError, PermissionError) as error:
+            if os.fstat(descriptor).st_ino != (path / LOCK).stat().st_ino:
+                raise BlockingIOError  # whoever had it has just removed it
+        except (BlockingIOError, PermissionError, FileNotFoundError) as error:
             raise refusal(
                 f"{path}: another command is writing to this folder; wait for its end, or choose another with -o"
             ) from error
@@ -191,6 +194,8 @@ def result_folder(
             yield _held[place]
         finally:
             del _held[place]
+            if not (path / MANIFEST).exists():  # nothing was written
+                (path / LOCK).unlink(missing_ok=True)
     finally:
         os.close(descriptor)
 
@@ -213,7 +218,8 @@ def result_written(path: Path, kind: str, *, overwrite: bool = False) -> Iterato
     A block within another of the same folder is part of it. Errors are those of `result_folder`; a file that is not
     this package's is one as soon as it would be replaced.
     """
-    with result_folder(path, kind, overwrite=overwrite) as folder:
+    held = _held.get((path.absolute(), threading.get_ident()))
+    with result_folder(path, kind, overwrite=overwrite) if held is None else contextlib.nullcontext(held) as folder:
         if folder.is_writing:
             yield folder
             return
@@ -237,6 +243,8 @@ def replacing(path: Path) -> Iterator[Path]:
     )
     if folder is not None:
         folder.require([name])
+    if folder is None:
+        path.parent.mkdir(parents=True, exist_ok=True)
     partial = _new_file(path if folder is None else folder.path / path.name)
     try:
         yield partial

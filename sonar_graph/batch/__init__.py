@@ -10,11 +10,11 @@ from sonar_graph.batch.statistics import (
     LEAST_PAIRS, Anees, PairedDifference, SampleSummary, anees, failure_rate, holm, least_p, paired, quantile,
     quantile_error, standard_error, summarise,
 )
-from sonar_graph.batch.store import BATCH, Limits, Where
+from sonar_graph.batch.store import Limits, Where
 from sonar_graph.batch.suite import read_suite
 
 __all__ = [
-    "ALL_LOGS", "Anees", "BATCH", "Batch", "GOING_ON", "GateVerdict", "KINDS", "LEAST_PAIRS", "Limits", "Metric",
+    "ALL_LOGS", "Anees", "Batch", "GOING_ON", "GateVerdict", "KINDS", "LEAST_PAIRS", "Limits", "Metric",
     "PairedDifference", "RESULTS", "RecordedBatch", "RecordedRun", "SampleSummary", "Where", "anees", "bless",
     "failure_rate", "gate", "holm", "is_batch", "least_p", "limits_of", "metrics_of",
     "paired", "plan_runs", "quantile", "quantile_error", "read_batch", "read_suite", "run_suite", "standard_error",

@@ -16,10 +16,10 @@ from pathlib import Path
 from sonar_graph.batch.plan import plan_runs
 from sonar_graph.batch.recorded import RESULTS, RecordedBatch, read_batch
 from sonar_graph.batch.result_table import write_results
-from sonar_graph.batch.store import BATCH, SUITE, Limits, PlannedRun, Progress, Row, RunOutcome, Store, Where
+from sonar_graph.batch.store import SUITE, Limits, PlannedRun, Progress, Row, RunOutcome, Store, Where
 from sonar_graph.batch.suite import SuiteFile, read_suite
 from sonar_graph.errors import BatchError
-from sonar_graph.files import replacing, result_folder, result_written
+from sonar_graph.files import BATCH, replacing, result_folder, result_written
 from sonar_graph.interrupts import deferred_interrupt, terminations_as_interrupts
 
 NEEDED_PACKAGES = ("distributed", "pyarrow")
@@ -158,7 +158,7 @@ class Batch:
                         "choose another folder with -o, or, where it only has a new name, give --overwrite"
                     )
             with result_written(folder, BATCH):  # from here on the folder is known as a batch's
-                written.require([SUITE, RESULTS])
+                written.require([RESULTS] if _is_same(folder / SUITE, file) else [SUITE, RESULTS])
             store.remove_partial()
             yield cls(file, runs, store)
 
@@ -209,8 +209,9 @@ class Batch:
 
     def _write_table(self) -> None:
         with deferred_interrupt(), result_written(self.store.folder, BATCH):
-            with replacing(self.store.folder / SUITE) as partial:
-                partial.write_text(self.file.text, encoding="utf-8")
+            if not _is_same(self.store.folder / SUITE, self.file):
+                with replacing(self.store.folder / SUITE) as partial:
+                    partial.write_text(self.file.text, encoding="utf-8")
             write_results(self.store, self.file.suite, self.runs)
 
     def _write_table_if_possible(self) -> bool:
@@ -221,6 +222,11 @@ class Batch:
             self._write_table()
             return True
         return False
+
+
+def _is_same(path: Path, file: SuiteFile) -> bool:
+    """Tell whether a file is the suite, such as the user's own in the folder that it is written to."""
+    return path.is_file() and path.read_bytes() == file.text.encode()
 
 
 def limits_of(file: SuiteFile, timeout_s: float | None) -> Limits:

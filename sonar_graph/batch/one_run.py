@@ -1,28 +1,21 @@
 """One run of a batch: sequence, estimator, scores; files as `compare` writes them, and a row.
 
-``python -m sonar_graph.batch.one_run`` is the process that does runs, one after the other. Requests come pickled on
-stdin and outcomes go pickled to what was stdout. Everything printed, also by native code, goes to stderr, which is the
-run's log. The process ends with stdin, so it never outlives the process that started it.
+``python -m sonar_graph.batch.one_run`` is the process that does runs, one after the other
+(`sonar_graph.evaluation.own_process`). Everything printed, also by native code, is the run's log.
 """
 
-import contextlib
-import faulthandler
 import json
 import logging
 import math
-import os
-import pickle
 import platform
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
@@ -34,11 +27,14 @@ from sonar_graph.errors import BatchError, EstimatorError
 from sonar_graph.estimator import load_estimator
 from sonar_graph.evaluation import (
     LIBRARIES,
+    READY,
     Comparison,
+    Tell,
     describe_environment,
     judge,
     one_line,
     run_estimator,
+    serve,
     write_comparison,
 )
 from sonar_graph.files import LOCK, MANIFEST
@@ -49,7 +45,6 @@ KEPT_SEQUENCES = 3
 """Sequences kept in memory, since estimators of one log mostly follow each other; one is that of the warm-up."""
 WARM_UP_LOG = ("basin", {"duration_s": 120.0, "laps": 1, "wrong_id_rate": 0.1})
 TWO_DIMENSIONS = 2
-READY = "ready"
 LOG = logging.getLogger(__name__)
 
 
@@ -93,7 +88,7 @@ def perform(run: PlannedRun, folder: Path) -> Row:
             sequence = _sequence(run.kind, _text(run.options), _text(run.content), run.seed, _text(run.landmarks))
             instants_ns = sequence.instants(run.rate_hz)
         with clock.on("estimate_s"):
-            result = run_estimator(sequence, run.estimator, run.overrides, instants_ns=instants_ns)
+            result = run_estimator(sequence, run.estimator, run.overrides, instants_ns=instants_ns, is_apart=True)
         comparison = judge(sequence, instants_ns, [result])
         command = {"command": f"sonar-graph bench: run {run.key} of {run.suite}"}
         comparison = replace(comparison, environment=comparison.environment | command)
@@ -190,44 +185,18 @@ def _told(versions: dict[str, str], names: list[str]) -> str:
     return ", ".join(f"{name} {versions.get(name, 'missing')}" for name in names)
 
 
-def main() -> None:
-    """Do runs until stdin ends."""
-    answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-    faulthandler.enable()
-    logging.basicConfig(stream=sys.stderr, level=logging.INFO)
-    requests: SimpleQueue[PlannedRun | Preparation] = SimpleQueue()
-
-    def listen() -> None:
-        with contextlib.suppress(EOFError, OSError):
-            while True:
-                requests.put(pickle.load(sys.stdin.buffer))
-        os._exit(0)
-
-    def answer(content: object) -> None:
-        pickle.dump(content, answers)
-        answers.flush()
-
-    threading.Thread(target=listen, daemon=True).start()
-    answer(READY)
-    while True:
-        request = requests.get()
-        try:
-            if isinstance(request, Preparation):
-                warm_up(request.run)
-                answer(READY)
-                continue
-            with tempfile.TemporaryDirectory(prefix="sonar-graph-run-") as scratch:
-                folder = Path(scratch)
-                row = perform(request, folder)
-                paths = sorted(
-                    path for path in folder.rglob("*") if path.is_file() and path.name not in (MANIFEST, LOCK)
-                )
-                files = {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
-            answer(RunOutcome(row, files))
-        except Exception as error:  # for the process that waits for the answer
-            answer(error)
+def answer(request: PlannedRun | Preparation, _tell: Tell) -> object:
+    """Outcome of a run, or `READY` after a warm-up."""
+    if isinstance(request, Preparation):
+        warm_up(request.run)
+        return READY
+    with tempfile.TemporaryDirectory(prefix="sonar-graph-run-") as scratch:
+        folder = Path(scratch)
+        row = perform(request, folder)
+        paths = sorted(path for path in folder.rglob("*") if path.is_file() and path.name not in (MANIFEST, LOCK))
+        return RunOutcome(row, {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths})
 
 
 if __name__ == "__main__":
-    main()
+    logging.basicConfig(stream=sys.stderr, level=logging.INFO)
+    serve(answer)

@@ -35,8 +35,8 @@ from sonar_graph.batch.store import PlannedRun
 from sonar_graph.batch.suite import LogEntry, Place, SuiteFile
 from sonar_graph.calibration import Section
 from sonar_graph.errors import BatchError, EstimatorError, SonarGraphError, UnknownEstimatorError
-from sonar_graph.estimator import installed_estimators, load_estimator
-from sonar_graph.evaluation import LIBRARIES
+from sonar_graph.estimator import installed_estimators, is_foreign, load_estimator
+from sonar_graph.evaluation import LIBRARIES, settings_of_request
 from sonar_graph.settings import faults_in, field_place, flattened, nested
 from sonar_graph.simulation import LandmarkOptions
 from sonar_graph.version import __version__
@@ -128,17 +128,24 @@ def contestants_of(file: SuiteFile) -> list[_Contestant]:
     found: list[_Contestant] = []
     for number, entry in enumerate(file.suite.estimators):
         place: Place = ("estimators", number)
+        model: type[Section] | None = None
         try:
-            model: type[Section] | None = load_estimator(entry.name).Params
+            if not (foreign := is_foreign(entry.name)):
+                model = load_estimator(entry.name).Params
         except UnknownEstimatorError as error:
             file.refuse((*place, "name"), str(error))
         except EstimatorError:  # its runs fail with the reason, and the others go on
-            model = None
+            pass
         for chosen in _combinations(file, place, entry.grid, entry.params, "params"):
             given = values = nested(chosen, entry.params)
             if model is not None:
                 table = _table_of(chosen, "params")
                 values = _validated(file, place, model, given, table).model_dump(mode="json")
+            elif foreign:
+                try:
+                    values = settings_of_request(entry.name, given) or given
+                except EstimatorError as error:
+                    file.refuse((*place, "params" if entry.params else "name"), str(error))
             variant = _label(entry.variant, chosen) or DEFAULT_VARIANT
             found.append(_Contestant(place, entry.name, variant, given, values))
     by_name: dict[str, _Contestant] = {}

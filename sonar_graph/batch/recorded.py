@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from sonar_graph.batch.store import BATCH, LOG, NOT_RUN, ROW, RUNS, SUITE
+from sonar_graph.batch.store import LOG, NOT_RUN, ROW, RUNS, SUITE
 from sonar_graph.errors import EvaluationError
-from sonar_graph.files import kind_of, read_json
+from sonar_graph.files import BATCH, kind_of, read_json
 from sonar_graph.measurements import Floats
 
 RESULTS = "results.parquet"

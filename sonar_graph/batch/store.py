@@ -24,8 +24,15 @@ from pathlib import Path
 from typing import Any, Literal
 
 from sonar_graph.errors import BatchError, EvaluationError
-from sonar_graph.evaluation import COMPARISON
-from sonar_graph.files import DIGEST_DIGITS, others_in, read_json, remove_written, strict_json, write_manifest
+from sonar_graph.files import (
+    COMPARISON,
+    DIGEST_DIGITS,
+    others_in,
+    read_json,
+    remove_written,
+    strict_json,
+    write_manifest,
+)
 
 Status = Literal["ok", "failed", "timeout", "memory", "killed"]
 NOT_RUN = "not run"
@@ -104,8 +111,6 @@ Progress = Callable[[PlannedRun, RunOutcome], None]
 RUNS, ROW, LOG = "runs", "row.json", "log.txt"
 KEY = "key"
 SUITE = "suite.toml"
-BATCH = "batch"
-"""Kind of result in the manifest of a folder."""
 _PARTIAL = ".partial-"
 _PARTIAL_NAME = re.compile(r"\.partial-\w+-[0-9a-f]{8}")
 

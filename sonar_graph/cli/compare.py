@@ -30,6 +30,7 @@ from sonar_graph.cli.outputs import progress_bars, working, writable_folder, wri
 from sonar_graph.cli.recognise import RecogniserOptions, recognise_log, warn_of_other_designs
 from sonar_graph.cli.simulate import write_basin
 from sonar_graph.errors import EstimatorError, EvaluationError, LogError
+from sonar_graph.files import BATCH, COMPARISON, result_written
 
 if TYPE_CHECKING:
     from sonar_graph.evaluation import Comparison
@@ -68,8 +69,7 @@ def run(
     overwrite: Overwrite = False,
 ) -> None:
     """Run one estimator on a log; write its trajectories, landmarks and scores."""
-    from sonar_graph.evaluation import COMPARISON, write_comparison, write_viewer_files
-    from sonar_graph.files import result_written
+    from sonar_graph.evaluation import write_comparison, write_viewer_files
 
     names, recognition = [estimator], RecogniserOptions()
     with (
@@ -125,7 +125,7 @@ def report(
     overwrite: Overwrite = False,
 ) -> None:
     """Write report.html, and a batch's tables, anew from what compare, run or bench left in a folder."""
-    from sonar_graph.batch import BATCH, is_batch
+    from sonar_graph.batch import is_batch
     from sonar_graph.evaluation import read_comparison
     from sonar_graph.report import write_page
 

@@ -13,7 +13,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from sonar_graph.cli.arguments import printable
 from sonar_graph.errors import EvaluationError, LogError, SonarGraphError
-from sonar_graph.files import result_folder
+from sonar_graph.files import COMPARISON, result_folder
 
 
 def writable_log(path: Path, source: Path | None = None, *, overwrite: bool = False) -> Path:
@@ -52,7 +52,7 @@ def writable_folder(
     names: Iterable[str],
     sources: Iterable[Path | None] = (),
     *,
-    kind: str = "comparison",
+    kind: str = COMPARISON,
     overwrite: bool = False,
 ) -> Iterator[Path]:
     """Make a folder for results of some names and keep other commands out of it while the block runs.

@@ -6,20 +6,24 @@ Only calls of the estimator are timed. Results are checked before they are score
 import contextlib
 import copy
 import logging
+import sys
 import textwrap
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sonar_graph.calibration import Section
 from sonar_graph.errors import EstimatorError, EvaluationError, UnknownEstimatorError
-from sonar_graph.estimator import Estimator, load_estimator, make_params, refused_rows_of, withheld_of
+from sonar_graph.estimator import Estimator, is_foreign, load_estimator, make_params, refused_rows_of, withheld_of
+from sonar_graph.evaluation.own_process import KilledError, OwnProcess, Tell, serve
 from sonar_graph.evaluation.results import MapSoFar, RunResult
 from sonar_graph.evaluation.scored_instants import kept_map_instants
+from sonar_graph.interrupts import noticed_interrupts
 from sonar_graph.measurements import Floats, Ints, LandmarkDetections, Measurements
 from sonar_graph.sequence import Sequence, require_sequence
 from sonar_graph.states import Estimate, LandmarkMap, RefusedRow, Trajectory
@@ -121,6 +125,7 @@ def run_estimator(
     instants_ns: Ints | None = None,
     rate_hz: float = 2.0,
     interim_maps: bool = True,
+    is_apart: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> RunResult:
     """Replay a sequence into an estimator and keep its estimates, with the duration of each call.
@@ -128,7 +133,8 @@ def run_estimator(
     The log is cut into steps before the clock starts, and a second instance of the estimator takes the first of them,
     so that first calls are not counted; time in which numba compiles later is taken off. Only calls of the estimator
     are timed. The map is kept at `kept_map_instants`; asking for it before the end is not timed. The estimator gets a
-    copy of the measurements, so that one that changes them does not change those of the next.
+    copy of the measurements, so that one that changes them does not change those of the next. One of another package
+    runs in a process of its own: what it does to numpy, the working folder or the environment stays there.
 
     Parameters
     ----------
@@ -167,6 +173,8 @@ def run_estimator(
     """
     require_sequence(sequence, "run_estimator(sequence, name)")
     instants = sequence.instants(rate_hz) if instants_ns is None else instants_ns
+    if not is_apart and is_foreign(name):
+        return _run_apart(_Request(name, overrides or {}, sequence, instants, interim_maps), progress)
     try:
         kind = load_estimator(name)
     except UnknownEstimatorError:
@@ -181,13 +189,95 @@ def run_estimator(
 
 def check_request(name: str, overrides: dict[str, Any] | None = None) -> None:
     """Raise for a name or setting that does not exist, as `run_estimator` does, without running anything."""
+    settings_of_request(name, overrides or {})
+
+
+def settings_of_request(name: str, overrides: dict[str, Any], *, is_apart: bool = False) -> dict[str, Any] | None:
+    """All settings of an estimator with some replaced; None where it cannot be loaded, and its run will fail.
+
+    Raises `EstimatorError` for a name or setting that does not exist.
+    """
+    if not is_apart and is_foreign(name):
+        with _process() as process:
+            try:
+                return _asked(process, _Request(name, overrides), None)
+            except KilledError:
+                return None
     try:
         kind = load_estimator(name)
     except UnknownEstimatorError:
         raise
     except EstimatorError:
-        return
-    make_params(kind, overrides or {}, name)
+        return None
+    return make_params(kind, overrides, name).model_dump(mode="json")
+
+
+@dataclass(frozen=True)
+class _Request:
+    """What a process of its own is asked for: a run, or without a sequence only the settings."""
+
+    name: str
+    overrides: dict[str, Any]
+    sequence: Sequence | None = None
+    instants_ns: Ints | None = None
+    interim_maps: bool = True
+    path: list[str] = field(default_factory=lambda: list(sys.path))
+
+
+@contextlib.contextmanager
+def _process() -> Iterator[OwnProcess]:
+    process = OwnProcess(("-c", "from sonar_graph.evaluation.run import serve_runs; serve_runs()"))
+    try:
+        yield process
+    finally:
+        process.end()
+
+
+def _asked(process: OwnProcess, request: _Request, progress: Callable[[int, int], None] | None) -> Any:
+    process.answer()  # that it is ready
+    process.send(request)
+    while isinstance(answer := process.answer(), _Progress):
+        if progress:
+            progress(*answer)
+    return None if answer == NOTHING else answer
+
+
+def _run_apart(request: _Request, progress: Callable[[int, int], None] | None) -> RunResult:
+    with _process() as process:
+        try:
+            result: RunResult = _asked(process, request, progress)
+        except KilledError as error:
+            return RunResult(request.name, dict(request.overrides), "failed", str(error))
+        return result
+
+
+class _Progress(NamedTuple):
+    done: int
+    total: int
+
+
+NOTHING = "nothing"
+
+
+def serve_runs() -> None:
+    """Answer requests for runs and settings until stdin ends."""
+    serve(_answer)
+
+
+def _answer(request: _Request, tell: Tell) -> object:
+    """In a process of its own: do a run, or give the settings of one."""
+    sys.path[:] = request.path
+    if request.sequence is None:
+        return settings_of_request(request.name, request.overrides, is_apart=True) or NOTHING
+    return run_estimator(
+        request.sequence,
+        request.name,
+        request.overrides,
+        instants_ns=request.instants_ns,
+        interim_maps=request.interim_maps,
+        is_apart=True,
+        progress=lambda done, total: tell(_Progress(done, total)),
+    )
 
 
 AIDING = ("heading", "positions")
@@ -228,16 +318,25 @@ class _Replay:
         self._asked: set[str] = set()
         self._maps: list[MapSoFar] = []
         self._stage = "at the start"
+        self._check_interrupt: Callable[[], None]
 
     def run(self, kind: type[Estimator], progress: Callable[[int, int], None] | None) -> RunResult:
         """Everything from construction to the final map."""
+        with noticed_interrupts() as self._check_interrupt:
+            result = self._run(kind, progress)
+            self._check_interrupt()
+            return result
+
+    def _run(self, kind: type[Estimator], progress: Callable[[int, int], None] | None) -> RunResult:
         self._warm_up(kind)
+        self._check_interrupt()
         memory, estimator = PeakMemory(), None
         try:
             estimator = self._fresh(kind)
             self._process(estimator, progress)
             return self._finish(estimator, memory)
-        except Exception as error:  # a third party's estimator may fail in any way, and the others still run
+        except (Exception, SystemExit) as error:  # an estimator may fail in any way, and the others still run
+            self._check_interrupt()
             LOG.info("%s failed %s", self._name, self._stage, exc_info=True)
             told: dict[str, Any] = {}  # rows refused before are often why it failed
             if estimator is not None:
@@ -263,7 +362,7 @@ class _Replay:
 
         named = [i for i, step in enumerate(self._steps) if is_named(step.detections)]
         last = named[min(len(named), WARM_UP_FRAMES) - 1] if named else WARM_UP_STEPS
-        with contextlib.suppress(Exception):  # what fails here fails again below, where it is reported
+        with contextlib.suppress(Exception, SystemExit):  # what fails here fails again below, where it is reported
             estimator = self._fresh(kind)
             for step in self._steps[: min(last, MAX_WARM_UP_STEPS) + 1]:
                 estimator.process(copy.deepcopy(step))
@@ -278,6 +377,7 @@ class _Replay:
             before = time.perf_counter() - compiling_s()
             estimate = estimator.process(given)
             self._update_s.append(time.perf_counter() - compiling_s() - before)
+            self._check_interrupt()
             if estimate is not None and estimate.stamp_ns != end_ns:
                 raise EvaluationError(
                     f"process returned an estimate for {estimate.stamp_ns} ns when asked for {end_ns} ns"
@@ -332,6 +432,8 @@ class _Replay:
         return RunResult(self._name, params, status, reason, update_s=np.array(self._update_s), **outcome)
 
 
-def one_line(error: Exception) -> str:
+def one_line(error: BaseException) -> str:
     """The exception's type and message without line breaks."""
+    if isinstance(error, SystemExit):
+        return f"it called sys.exit({error})"
     return textwrap.shorten(f"{type(error).__name__}: {error}", REASON_WIDTH, placeholder=" ...")

@@ -31,7 +31,7 @@ from sonar_graph.calibration import Calibration
 from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation.metrics import rmse
 from sonar_graph.evaluation.results import Comparison, Ensemble, ErrorSeries, Kind, MapSoFar, RunResult, Score, gathered
-from sonar_graph.files import read_json, replacing, result_written, write_json
+from sonar_graph.files import COMPARISON, read_json, replacing, result_written, write_json
 from sonar_graph.logs import Picture, write_landmarks_csv, write_result, write_tum
 from sonar_graph.logs.mcap import Attachment
 from sonar_graph.measurements import Dvl, Imu, LandmarkDetections
@@ -48,8 +48,6 @@ INDEX, SEQUENCE, RUNS = "comparison.json", "sequence.npz", "runs"
 RESULT, SERIES, RESULT_LOG = "result.json", "series.npz", "result.mcap"
 ENSEMBLES = "ensembles.json"
 ESTIMATES = ("trajectory.tum", "causal.tum", "landmarks.csv")
-COMPARISON = "comparison"
-"""Kind of result in the manifest of a folder."""
 
 
 def written_names(estimators: Iterable[str]) -> list[str]:
@@ -75,8 +73,7 @@ def write_comparison(comparison: Comparison, folder: Path) -> None:
         if name in ("", ".", "..") or any(character in name for character in '/\\:*?"<>|'):
             raise EvaluationError(f"estimator name {name!r} cannot name a folder; install it under another name")
     with result_written(folder, COMPARISON) as written:
-        written.remove(name for name in written.names if name.startswith((f"{RUNS}/", f"{PICTURE_FOLDER}/")))
-        written.remove([INDEX, ENSEMBLES, RECOGNITION])
+        written.remove([INDEX, ENSEMBLES, *(name for name in written.names if name.startswith(f"{RUNS}/"))])
         _write(comparison, folder)
 
 

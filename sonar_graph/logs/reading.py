@@ -227,7 +227,16 @@ class Assembly:
         if "detections" in self._topics and (messages := self._topics["detections"].messages()):
             frames["sonar"] = self._adapters["detections"].frame_in(messages)
         tree = static_frames(self._recording)
-        mountings = {name: found for name, frame in frames.items() if (found := mounting_of(frame, tree)) is not None}
+        mountings = {}
+        for name, frame in frames.items():
+            try:
+                found = mounting_of(frame, tree)
+            except LogError as error:
+                if name not in stated:
+                    raise LogError(f"{self._recording.path}: {name}: {error}") from error
+                found = None
+            if found is not None:
+                mountings[name] = found
         mounted = mountings.keys() | stated
         self._is_mounting_known = "dvl" in mounted
         source = "from the log"

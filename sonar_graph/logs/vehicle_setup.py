@@ -24,14 +24,16 @@ from sonar_graph.files import regular
 from sonar_graph.logs.cdr import Bytes, Value, definition, encode, parse_definition, short_name
 from sonar_graph.logs.mcap import Keep, Recording, scan
 from sonar_graph.logs.roles import TF
-from sonar_graph.measurements import Dvl, Ints
+from sonar_graph.measurements import Dvl, Floats, Ints
 from sonar_graph.settings import faults_in, parse
 
 METADATA = "sonar_graph"
 """Name of the metadata record with name, calibration and notes."""
 BODY_FRAME = "base_link"
-FrameTree = dict[str, tuple[str, gtsam.Pose3]]
-"""Parent and ``parent_T_frame`` of each frame."""
+FrameTree = dict[str, tuple[str, gtsam.Pose3 | str]]
+"""Parent and ``parent_T_frame`` of each frame; instead of a pose the fault of one that cannot be."""
+LARGEST_LEVER_M = 1000.0
+"""No vehicle is as long."""
 Values = Mapping[str, Any]
 OPTIONAL = {name for name, value in Calibration().model_dump().items() if value is None}
 """Fields of a calibration that may be absent."""
@@ -59,25 +61,47 @@ def static_frames(recording: Recording) -> FrameTree:
             )
             for message, (children, parents) in enumerate(names):
                 for i, (child, parent) in enumerate(zip(children, parents, strict=True)):
-                    rotation = gtsam.Rot3.Quaternion(*rotations[message, i])
-                    parent_T_child = gtsam.Pose3(rotation, translations[message, i])
-                    frames[child.lstrip("/")] = parent.lstrip("/"), parent_T_child
+                    pose = _pose(translations[message, i], rotations[message, i])
+                    frames[child.lstrip("/")] = parent.lstrip("/"), pose
     return frames
 
 
+def _pose(translation_m: Floats, quaternion_wxyz: Floats) -> gtsam.Pose3 | str:
+    """Pose of a transform, or its fault."""
+    length = float(np.linalg.norm(quaternion_wxyz))
+    if not (np.isfinite(length) and np.isfinite(translation_m).all()):
+        return "has numbers that are not finite"
+    if not 0.5 < length < 2.0:
+        return f"has a quaternion of length {length:g}, and one of a rotation has 1"
+    if abs(length - 1) > 1e-6:  # unit quaternions keep every bit
+        quaternion_wxyz = quaternion_wxyz / length
+    return gtsam.Pose3(gtsam.Rot3.Quaternion(*quaternion_wxyz), translation_m)
+
+
 def mounting_of(frame: str, frames: FrameTree) -> Mounting | None:
-    """``body_T_frame`` through all frames in between; None where the frame does not hang on the body."""
+    """``body_T_frame`` through all frames in between; None where the frame does not hang on the body.
+
+    A LogError names the transform that cannot be one.
+    """
     body_T_sensor, name = gtsam.Pose3(), frame.lstrip("/")
     for _ in range(len(frames) + 1):
         if name == BODY_FRAME:
+            if not np.linalg.norm(body_T_sensor.translation()) < LARGEST_LEVER_M:
+                raise _unusable(frame, f"is {np.linalg.norm(body_T_sensor.translation()):g} m from {BODY_FRAME}")
             x_m, y_m, z_m = body_T_sensor.translation().tolist()
             roll, pitch, yaw = body_T_sensor.rotation().rpy().tolist()
             return Mounting(translation_m=(x_m, y_m, z_m), rpy_rad=(roll, pitch, yaw))
         if name not in frames:
             break
-        name, parent_T_frame = frames[name]
+        child, (name, parent_T_frame) = name, frames[name]
+        if isinstance(parent_T_frame, str):
+            raise _unusable(frame, f"the transform from {name} to {child} {parent_T_frame}")
         body_T_sensor = parent_T_frame * body_T_sensor
     return None
+
+
+def _unusable(frame: str, fault: str) -> LogError:
+    return LogError(f"/tf_static: {frame}: {fault}; state the sensor's mounting in a file for --calibration")
 
 
 def encode_mountings(calibration: Calibration) -> Bytes:

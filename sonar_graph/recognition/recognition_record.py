@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sonar_graph.files import read_json, replacing, write_json
+from sonar_graph.files import COMPARISON, read_json, replacing, result_written, write_json
 from sonar_graph.measurements import LandmarkDetections
 from sonar_graph.sonar import Fan
 from sonar_graph.states import LandmarkMap
@@ -98,15 +98,17 @@ class Recognition:
 
 
 def write_recognition(recognition: Recognition | None, folder: Path) -> None:
-    """Write ``recognition.json`` and the pictures that the report shows."""
-    if recognition is None:
-        return
-    shown = recognition.shown()
-    for picture in shown:
-        with replacing(folder / PICTURE_FOLDER / f"{picture.stamp_ns}.jpg") as partial:
-            partial.write_bytes(picture.jpeg)
-    pictures = [[p.stamp_ns, p.landmark_ids, p.probabilities] for p in shown]
-    write_json(folder / RECOGNITION, recognition.entry() | {"pictures": pictures})
+    """Write ``recognition.json`` and the pictures that the report shows; remove those of an earlier comparison."""
+    with result_written(folder, COMPARISON) as written:
+        written.remove([RECOGNITION, *(name for name in written.names if name.startswith(f"{PICTURE_FOLDER}/"))])
+        if recognition is None:
+            return
+        shown = recognition.shown()
+        for picture in shown:
+            with replacing(folder / PICTURE_FOLDER / f"{picture.stamp_ns}.jpg") as partial:
+                partial.write_bytes(picture.jpeg)
+        pictures = [[p.stamp_ns, p.landmark_ids, p.probabilities] for p in shown]
+        write_json(folder / RECOGNITION, recognition.entry() | {"pictures": pictures})
 
 
 def read_recognition(folder: Path) -> Recognition | None:

@@ -4,9 +4,9 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from sonar_graph.batch import BATCH, LEAST_PAIRS, RESULTS, RecordedBatch, metrics_of
+from sonar_graph.batch import LEAST_PAIRS, RESULTS, RecordedBatch, metrics_of
 from sonar_graph.evaluation import ESTIMATES
-from sonar_graph.files import replacing, result_written
+from sonar_graph.files import BATCH, replacing, result_written
 from sonar_graph.report import batch_figures as figures
 from sonar_graph.report import batch_summary as summary
 from sonar_graph.report import batch_tables as tables

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation import (
     ABSENT,
-    COMPARISON,
     DURATION_S,
     MAP_TIMES_S,
     NONE,
@@ -37,7 +36,7 @@ from sonar_graph.evaluation import (
     write_comparison,
     write_viewer_files,
 )
-from sonar_graph.files import replacing, result_written
+from sonar_graph.files import COMPARISON, replacing, result_written
 from sonar_graph.logs import PICTURES
 from sonar_graph.recognition import SURE
 from sonar_graph.report import figures, sentences

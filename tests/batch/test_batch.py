@@ -16,13 +16,14 @@ import pytest
 
 from sonar_graph.batch import batch as batch_module
 from sonar_graph.batch import cluster
-from sonar_graph.batch.batch import Batch, deferred_interrupt, limits_of, terminations_as_interrupts
+from sonar_graph.batch.batch import Batch, limits_of
 from sonar_graph.batch.one_run import perform
 from sonar_graph.batch.recorded import is_batch, read_batch
 from sonar_graph.batch.result_table import RESULTS, is_timing
 from sonar_graph.batch.store import Limits, PlannedRun, Progress, RunOutcome, Store, Where
 from sonar_graph.batch.suite import read_suite
 from sonar_graph.errors import BatchError, EvaluationError
+from sonar_graph.interrupts import deferred_interrupt, noticed_interrupts, terminations_as_interrupts
 
 from .conftest import BASIN, DEAD_RECKONING, HEADER
 
@@ -190,10 +191,10 @@ def test_failed_runs_are_kept_until_they_are_discarded(suite, tmp_path, in_this_
 def test_second_batch_in_a_folder_is_refused_and_touches_nothing(suite, tmp_path):
     folder = tmp_path / "out"
     with Batch.opened(read_suite(suite), folder) as batch:
-        half_written = folder / "runs" / f".partial-{batch.runs[0].key}-1"
+        half_written = folder / "runs" / f".partial-{batch.runs[0].key}-0123abcd"
         half_written.mkdir()
         suite.write_text(suite.read_text().replace("short", "other"))
-        with pytest.raises(BatchError, match="another batch is running"), Batch.opened(read_suite(suite), folder):
+        with pytest.raises(BatchError, match="another command is writing"), Batch.opened(read_suite(suite), folder):
             pass
         assert half_written.is_dir()
         assert not (folder / "suite.toml").exists()
@@ -260,6 +261,15 @@ def test_an_error_of_the_block_is_not_hidden_and_an_interrupt_outlives_it(handle
         failing_block()
     with pytest.raises(OSError, match="full"), deferred_interrupt():
         raise OSError("full")
+
+
+def test_an_interrupt_that_compiled_code_swallows_or_turns_into_another_error_is_noticed(handler):
+    with noticed_interrupts() as check:
+        check()
+        with contextlib.suppress(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            check()
 
 
 @pytest.mark.parametrize("handler", [signal.default_int_handler, signal.SIG_IGN], indirect=True)

@@ -71,15 +71,24 @@ def is_runner_of_this_test(process: psutil.Process) -> bool:
 
 
 def test_log_has_the_traceback_and_what_native_code_wrote_of_this_run_alone(planned, misbehaving):
-    outcome = perform_watched(planned("prints"), AMPLE)
+    runner = Runner()
+    outcome = runner.perform(planned("prints"), AMPLE)
     assert outcome.row["status"] == "failed"
     assert "written by native code" in outcome.log
     assert "RuntimeError: diverged" in outcome.log
     assert "Traceback" in outcome.log
     assert "runs/prints/result.json" in outcome.files
-    (runner,) = runners()
-    assert "diverged" not in perform_watched(planned(), AMPLE).log
-    assert runners() == [runner]
+    assert "diverged" not in runner.perform(planned(), AMPLE).log
+    runner.end()
+
+
+def test_a_process_is_kept_for_the_next_run_but_after_one_of_another_package(planned, misbehaving):
+    perform_watched(planned(), AMPLE)
+    (kept,) = runners()
+    perform_watched(planned(), AMPLE)
+    assert runners() == [kept]
+    perform_watched(planned("prints"), AMPLE)
+    assert not runners()
 
 
 def test_order_of_sets_does_not_hang_on_who_started_the_process(planned, misbehaving, monkeypatch):

@@ -33,7 +33,10 @@ def files(lane, lane_log, basin_content, tmp_path_factory) -> Path:
     texts |= {"broken.toml": DESIGN.format(id=1, size_m=-1, shape=CIRCLE)}
     texts |= {"large.toml": DESIGN.format(id=4, size_m=2.0, shape=CIRCLE.replace("0.15", "1.0"))}
     texts |= {"gyro.toml": "[imu]\ngyro_sigma = 1\n", "logs.toml": 'name = "x"\nreference = "isam2"\nlogs = 3\n'}
-    texts |= {"late.toml": SUITE, "killed/.lock": ""}
+    texts |= {
+        "late.toml": SUITE,
+        "killed/.sonar_graph.json": '{"format": "sonar_graph folder 1", "kind": "batch", "files": {}}',
+    }
     (folder / "killed").mkdir()
     for name, text in texts.items():
         (folder / name).write_text(text)

@@ -6,8 +6,10 @@ from pathlib import Path
 import pytest
 from mcap.writer import Writer
 
+from sonar_graph.cli.compare import result_names
 from sonar_graph.cli.outputs import writable_folder
 from sonar_graph.errors import EvaluationError
+from sonar_graph.files import LOCK, MANIFEST
 
 QUICK = ("--estimators", "dead-reckoning")
 
@@ -54,7 +56,9 @@ def test_a_part_of_a_bag_or_a_log_under_another_ending_is_not_overwritten_either
     assert (part.read_bytes(), basin.read_bytes()) == contents
 
 
-@pytest.mark.parametrize("name", ["result.mcap", "comparison.json", "report.html", "runs/isam2/trajectory.tum"])
+@pytest.mark.parametrize(
+    "name", ["result.mcap", "comparison.json", "report.html", "runs/dead-reckoning/trajectory.tum"]
+)
 def test_results_never_overwrite_the_log(name, basin, run, tmp_path, capsys):
     log = tmp_path / "results" / name
     log.parent.mkdir(parents=True)
@@ -84,11 +88,13 @@ def test_a_comparison_beside_the_log_can_be_repeated_and_no_file_of_it_is_both_r
     for _ in range(2):
         assert run("compare", basin, "-o", tmp_path, *QUICK) == 0
     assert basin.read_bytes() == before
-    written = [path for path in tmp_path.rglob("*") if path.is_file() and path != basin]
+    written = {path for path in tmp_path.rglob("*") if path.is_file()} - {basin, tmp_path / LOCK, tmp_path / MANIFEST}
+    names = result_names(["dead-reckoning"])
+    assert {path.relative_to(tmp_path).as_posix() for path in written} <= set(names)
     assert len(written) > 8
     for path in written:
-        with pytest.raises(EvaluationError, match="is what is read"):
-            writable_folder(tmp_path, [path])
+        with pytest.raises(EvaluationError, match="is what is read"), writable_folder(tmp_path, names, [path]):
+            pass
 
 
 @pytest.mark.parametrize("content", ["another program's", "a text", "cut off"])
@@ -113,3 +119,21 @@ def test_commands_can_be_repeated_over_what_they_wrote_and_over_nothing(run, tmp
     (tmp_path / "link.mcap").symlink_to(tmp_path / "missing.mcap")
     assert run("convert", "victoria-park", "-o", tmp_path / "link.mcap") == 0
     assert (tmp_path / "link.mcap").stat().st_size > 0
+
+
+OURS = ["recognised/1.jpg", "runs/dead-reckoning/result.json", "report.html", "comparison.json"]
+THEIRS = ["recognised/mine.jpg", "runs/mine/result.json", ".log.mcap.partial", ".partial-log.mcap", "log.mcap.part"]
+
+
+@pytest.mark.parametrize("ours", [None, *OURS])
+def test_files_of_the_user_below_a_folder_of_results_stay_or_are_named(ours, basin, run, tmp_path, capsys):
+    folder = tmp_path / "out"
+    mine = [folder / name for name in [*THEIRS, *([ours] if ours else [])]]
+    for path in mine:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("mine")
+    for command in (("compare", basin, *QUICK), ("run", basin, "--estimator", "dead-reckoning")):
+        assert run(*command, "-o", folder) == (2 if ours else 0)
+        assert (f"holds {ours}, which sonar-graph did not write" in capsys.readouterr().err) == bool(ours)
+    assert run("convert", "victoria-park", "-o", folder / "log.mcap") == 0
+    assert {path.read_text() for path in mine} == {"mine"}

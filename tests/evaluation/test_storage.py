@@ -131,26 +131,24 @@ def test_nothing_of_an_earlier_comparison_remains(comparison, tmp_path):
     write_comparison(compare(straight_sequence(), ["other", "offset"]), tmp_path)
     (tmp_path / "runs" / "other" / "my notes.txt").write_text("kept")
     (tmp_path / "runs" / "broken").mkdir()
-    (tmp_path / "runs" / "broken" / "trajectory.tum").write_text("of a run that went well")
+    (tmp_path / "runs" / "broken" / "trajectory.tum").write_text("of a run that another program did")
     write_comparison(comparison, tmp_path)
     assert [path.name for path in (tmp_path / "runs" / "other").iterdir()] == ["my notes.txt"]
-    assert not (tmp_path / "runs" / "broken" / "trajectory.tum").exists()
+    assert (tmp_path / "runs" / "broken" / "trajectory.tum").exists()
     assert [run.estimator for run in read_comparison(tmp_path).runs] == ["offset", "broken"]
 
 
-def test_an_interrupted_writing_is_not_taken_for_a_comparison(comparison, monkeypatch, tmp_path):
-    write_comparison(comparison, tmp_path)
+def test_an_interrupted_writing_leaves_the_earlier_comparison_as_it_was(comparison, monkeypatch, tmp_path):
+    write_comparison(compare(straight_sequence(), ["other", "offset"]), tmp_path)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
 
-    def fail(path: Path, _: Any) -> None:
-        path.write_text("half a line")
+    def fail(_path: Path, _: Any) -> None:
         raise OSError("no space left on device")
 
     monkeypatch.setattr("sonar_graph.evaluation.storage.write_landmarks_csv", fail)
     with pytest.raises(OSError, match="no space"):
         write_comparison(comparison, tmp_path)
-    assert not list(tmp_path.rglob(".partial-*"))
-    with pytest.raises(EvaluationError, match=r"no comparison\.json"):
-        read_comparison(tmp_path)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
 def test_a_name_that_leaves_the_folder_is_refused(comparison, tmp_path):

@@ -279,7 +279,8 @@ def test_a_killed_writer_loses_at_most_its_open_chunk(tmp_path: Path) -> None:
         rest, _ = writer.communicate()
     last = int(rest.splitlines()[-1]) if rest.endswith(b"\n") and rest.strip() else told
     assert not path.exists()  # never a file that looks complete
-    recording = scan_all(path.with_name(f".partial-{path.name}"))
+    (partial,) = tmp_path.glob(".log.mcap.*.partial.mcap")
+    recording = scan_all(partial)
     found = recording.topics["/n"].log_times_ns
     np.testing.assert_array_equal(found, np.arange(len(found)))
     assert len(found) >= last - 65536 // 1000 - 1

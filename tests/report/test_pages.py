@@ -167,7 +167,7 @@ def test_examples_of_the_front_door_run(tmp_path):
     compared = basin_comparison(60)
     assert comparison_page.write_report(compared, str(tmp_path / "new")) == tmp_path / "new" / "report.html"
     assert {path.name for path in (tmp_path / "new").iterdir()} == {
-        *("report.html", "comparison.json", "sequence.npz", "runs"),
+        *("report.html", "comparison.json", "sequence.npz", "runs", ".sonar_graph.json", ".lock"),
         *("result.mcap", "result.foxglove.json", "result.rviz"),
     }
     assert list(read_comparison(tmp_path / "new").scores) == list(compared.scores)

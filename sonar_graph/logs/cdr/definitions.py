@@ -189,7 +189,7 @@ _SHOWN = 80
 _LONGEST_TEXT = 1 << 20
 _SECTION = re.compile(r"^=+\n[ \t]*MSG:[ \t]*(\S+)\n", re.MULTILINE)
 _FIELD = re.compile(
-    r"^(?P<type>[\w/]+)(?:<=\d+)?(?P<array>\[(?P<length>(?:<=)?\d{0,9})\])?\s+(?P<name>[A-Za-z]\w*)\s*(?P<rest>.*)$"
+    r"^(?P<type>[\w/]+)(?:<=\d+)?(?P<array>\[(?P<length>(?:<=)?\d{0,12})\])?\s+(?P<name>[A-Za-z]\w*)\s*(?P<rest>.*)$"
 )
 
 

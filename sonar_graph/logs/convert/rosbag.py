@@ -7,6 +7,7 @@ same to the nanosecond. The types and MD5 sums of a ROS 1 bag are kept in a meta
 
 from __future__ import annotations
 
+import bz2
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -14,11 +15,20 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import lz4.frame
 from mcap.writer import Writer
 
-from sonar_graph.errors import LogError
+from sonar_graph.errors import LogError, SonarGraphError
 from sonar_graph.files import regular, written_whole
-from sonar_graph.logs.mcap import LIBRARY, ROSBAG2_METADATA, START_BYTES, TRANSIENT_LOCAL, Progress, why_no_bag
+from sonar_graph.logs.mcap import (
+    LARGEST_BYTES,
+    LIBRARY,
+    ROSBAG2_METADATA,
+    START_BYTES,
+    TRANSIENT_LOCAL,
+    Progress,
+    why_no_bag,
+)
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -29,7 +39,7 @@ if TYPE_CHECKING:
 SOURCE_METADATA = "rosbag"
 """Metadata record of the type and MD5 sum of each topic in the bag."""
 _RENAMED = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
-_CHUNK_BYTES = 1 << 20
+_CHUNK_BYTES = _PIECE_BYTES = 1 << 20
 _STEPS = 1000
 _INSTALL = "pip install 'sonar-graph[rosbag]'"
 Recode = Callable[[bytes], memoryview]
@@ -79,10 +89,12 @@ def convert_rosbag(source: Path, output: Path, progress: Progress | None = None)
 @contextmanager
 def _open_bag(source: Path) -> Iterator[AnyReader]:
     try:
-        from rosbags.highlevel import AnyReader, AnyReaderError
+        from rosbags.highlevel import AnyReader
+        from rosbags.rosbag1 import reader as rosbag1
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise LogError(f"{source}: bags are read by the rosbags library, which is not installed: {_INSTALL}") from error
+    rosbag1.decompressors.update(bz2=limited_bz2, lz4=limited_lz4)  # its own have no limit
     if source.is_file():
         with regular(source).open("rb") as stream:
             fault = why_no_bag(source, stream.read(START_BYTES))
@@ -93,12 +105,43 @@ def _open_bag(source: Path) -> Iterator[AnyReader]:
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as bag:
             yield bag
-    except (AnyReaderError, FileNotFoundError) as error:
+    except SonarGraphError:
+        raise
+    except Exception as error:  # the library raises whatever its parts raise
+        if isinstance(error, OSError) and not isinstance(error, FileNotFoundError):
+            raise
         advice = {
             ".bag": "of one that was not closed `rosbag reindex` makes a whole one",
             ".db3": "give the folder with the .db3 file and its metadata.yaml (`ros2 bag reindex` makes one)",
         }.get(source.suffix, "give a ROS 1 .bag, or the folder of a ROS 2 bag with its metadata.yaml")
         raise LogError(f"{source} cannot be read as a bag: {error}; {advice}") from error
+
+
+def limited_bz2(packed: bytes) -> bytes:
+    """Content of a bz2 chunk; a LogError where it has more than `LARGEST_BYTES`."""
+    chunk = bz2.BZ2Decompressor()
+    return _whole(chunk.decompress(packed, LARGEST_BYTES + 1))
+
+
+def limited_lz4(packed: bytes) -> bytes:
+    """Content of an lz4 chunk; a LogError where it has more than `LARGEST_BYTES`."""
+    chunk, content = lz4.frame.LZ4FrameDecompressor(), bytearray()
+    while not chunk.eof and len(content) <= LARGEST_BYTES:
+        part = chunk.decompress(packed, max_length=_PIECE_BYTES)
+        if not part and chunk.needs_input:
+            raise LogError("a chunk is cut off")
+        content += part
+        packed = b""
+    return _whole(bytes(content))
+
+
+def _whole(content: bytes) -> bytes:
+    if len(content) > LARGEST_BYTES:
+        raise LogError(
+            f"a chunk of the bag has more than {LARGEST_BYTES} bytes, which is too much at once: `rosbag decompress` "
+            "and `rosbag filter` write smaller chunks"
+        )
+    return content
 
 
 class _BagCopy:

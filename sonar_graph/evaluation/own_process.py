@@ -1,0 +1,163 @@
+"""Processes that answer requests, so that what native code or another package does to a process stays there.
+
+Requests come pickled on stdin, and answers go pickled to what was stdout. Everything printed, also by native code, goes
+to stderr. A process ends with its stdin, so it never outlives the one that started it.
+"""
+
+import contextlib
+import faulthandler
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Mapping
+from queue import Empty, SimpleQueue
+from typing import IO, Any, BinaryIO, NoReturn
+
+READY = "ready"
+LOOK_EVERY_S = 0.2
+JOIN_S = 5.0
+"""Longest wait for the thread that listens to an ended process, whose detached children may keep the pipe open."""
+Tell = Callable[[object], None]
+"""Function that sends something before the answer, such as progress."""
+
+
+class KilledError(Exception):
+    """A process, or what it was asked to do, was ended; the text says how."""
+
+
+class OwnProcess:
+    """A Python process of its own, whose program calls `serve`; its first answer is `READY`.
+
+    ``program``: ``-m`` and a module, or ``-c`` and code.
+
+    With ``is_leader`` it and its children have a session of their own, which Ctrl-C in a terminal does not reach and
+    which `end` ends as a whole.
+    """
+
+    def __init__(
+        self,
+        program: tuple[str, str],
+        environment: Mapping[str, str] | None = None,
+        log: IO[bytes] | None = None,
+        *,
+        is_leader: bool = False,
+    ) -> None:
+        self._is_leader = is_leader
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", *program],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=log,
+            env=os.environ | dict(environment or {}),
+            start_new_session=is_leader,
+        )
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._requests: IO[bytes] = self._process.stdin
+        self._answers: SimpleQueue[Any] = SimpleQueue()
+        self._collector = threading.Thread(target=self._collect, args=(self._process.stdout,), daemon=True)
+        self._collector.start()
+
+    def _collect(self, source: BinaryIO) -> None:
+        """Put the answers of the process into the queue; None at their end."""
+        with source, contextlib.suppress(Exception):  # its end, or an answer of classes that are not known here
+            while True:
+                self._answers.put(pickle.load(source))
+        self._answers.put(None)
+
+    @property
+    def pid(self) -> int:
+        """Number of the process."""
+        return self._process.pid
+
+    def is_alive(self) -> bool:
+        """Tell whether it runs."""
+        return self._process.poll() is None
+
+    def send(self, request: object) -> None:
+        """Send a request; a process that is gone is noticed by its missing answer."""
+        with contextlib.suppress(OSError):
+            pickle.dump(request, self._requests)
+            self._requests.flush()
+
+    def look(self) -> Any:
+        """The next answer; None if there is none within `LOOK_EVERY_S`.
+
+        Raises `KilledError` when the process ended, and an answer that is an exception.
+        """
+        is_gone = not self.is_alive()
+        with contextlib.suppress(Empty):
+            answer = self._answers.get(timeout=LOOK_EVERY_S)
+            if answer is None:
+                raise KilledError(self._ending())
+            if isinstance(answer, Exception):
+                raise answer
+            return answer
+        if is_gone:  # its children may live on and keep the pipe open
+            raise KilledError(self._ending())
+        return None
+
+    def answer(self) -> Any:
+        """The next answer, whenever it comes; errors are those of `look`."""
+        while (answer := self.look()) is None:
+            pass
+        return answer
+
+    def end(self) -> None:
+        """Kill the process; of a leader also its children, which hold its pipe open."""
+        with contextlib.suppress(ProcessLookupError):
+            if self._is_leader:
+                os.killpg(self.pid, signal.SIGKILL)
+            else:
+                self._process.kill()
+        self._process.wait()
+        self._collector.join(JOIN_S)
+        with contextlib.suppress(OSError):
+            self._requests.close()
+
+    def _ending(self) -> str:
+        try:
+            code = self._process.wait(JOIN_S)
+        except subprocess.TimeoutExpired:
+            return "its answer cannot be read"
+        if code >= 0:
+            return f"its process ended with code {code}"
+        return f"its process was ended by {signal.Signals(-code).name}"
+
+
+def serve(handle: Callable[[Any, Tell], object]) -> NoReturn:
+    """Answer requests until stdin ends; what ``handle`` raises is the answer."""
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    faulthandler.enable()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # who started it ends it
+    requests: SimpleQueue[Any] = SimpleQueue()
+
+    def listen() -> None:
+        with contextlib.suppress(EOFError, OSError):
+            while True:
+                requests.put(pickle.load(sys.stdin.buffer))
+        os._exit(0)
+
+    def tell(content: object) -> None:
+        try:
+            packed = pickle.dumps(content)
+        except Exception:
+            packed = pickle.dumps(RuntimeError(f"{type(content).__name__}: {content}"))
+        answers.write(packed)
+        answers.flush()
+
+    threading.Thread(target=listen, daemon=True).start()
+    tell(READY)
+    while True:
+        request = requests.get()
+        try:
+            answer = handle(request, tell)
+        except Exception as error:  # for the process that waits for the answer
+            answer = error
+        except BaseException as error:  # of an estimator that calls sys.exit or raises such things itself
+            answer = KilledError(f"{type(error).__name__}: {error}")
+        tell(answer)

@@ -1,0 +1,126 @@
+"""Estimators of other packages run in processes of their own, and what they do stays there."""
+
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sonar_graph.errors import EstimatorError
+from sonar_graph.estimator import is_foreign
+from sonar_graph.evaluation import check_request, compare, run_estimator
+from sonar_graph.simulation import MissionOptions, simulate_mission
+
+PLUGIN = """
+import locale, os, signal, sys
+import numpy as np
+from baselines.dead_reckoning import DeadReckoning
+
+def meddle():
+    np.sqrt = lambda value: 2.0 * value
+    np.linalg.norm = np.abs
+    np.seterr(all="raise")
+    np.random.seed(3)
+    sys.setrecursionlimit(60 + len(__import__("inspect").stack()))
+    os.chdir("/")
+    os.environ["OMP_NUM_THREADS"] = "7"
+    os.environ["TZ"] = "Asia/Tokyo"
+    locale.setlocale(locale.LC_ALL, "C")
+
+if "SONAR_GRAPH_MEDDLES" in os.environ:
+    sys.exit(7)
+
+class Meddling(DeadReckoning):
+    def process(self, measurements):
+        estimate = super().process(measurements)
+        meddle()
+        return estimate
+
+class Exits(DeadReckoning):
+    def process(self, measurements):
+        sys.exit(3)
+
+class ExitsAtOnce(DeadReckoning):
+    def process(self, measurements):
+        os._exit(4)
+
+class Aborts(DeadReckoning):
+    def process(self, measurements):
+        os.abort()
+
+class Interrupts(DeadReckoning):
+    def process(self, measurements):
+        raise KeyboardInterrupt("of its own")
+"""
+CLASSES = ("Meddling", "Exits", "ExitsAtOnce", "Aborts", "Interrupts")
+
+
+@pytest.fixture
+def plugin(tmp_path, monkeypatch) -> None:
+    """Estimators of another package, called ``their-NAME``."""
+    about = tmp_path / "theirs-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: theirs\nVersion: 1.0\n")
+    points = [f"their-{name.lower()} = theirs:{name}" for name in CLASSES]
+    (about / "entry_points.txt").write_text("\n".join(["[sonar_graph.estimators]", *points, ""]))
+    (tmp_path / "theirs.py").write_text(PLUGIN)
+    monkeypatch.syspath_prepend(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def mission():
+    return simulate_mission(MissionOptions(duration_s=10.0))
+
+
+def state() -> tuple[object, ...]:
+    return np.sqrt, np.linalg.norm, np.geterr(), sys.getrecursionlimit(), Path.cwd(), dict(os.environ)
+
+
+def test_what_an_estimator_does_to_its_process_changes_no_other_ones_numbers(plugin, mission):
+    own = ["dead-reckoning", "ekf-slam"]
+    alone, before = compare(mission, own), state()
+    together = compare(mission, [own[0], "their-meddling", own[1]])
+    assert state() == before
+    assert "theirs" not in sys.modules
+    runs = {run.estimator: run for run in together.runs}
+    for run in alone.runs:
+        other = runs[run.estimator]
+        for one, two in ((run.causal, other.causal), (run.smoothed, other.smoothed)):
+            for name in ("stamps_ns", "positions", "quaternions_xyzw", "covariances"):
+                assert getattr(one, name).tobytes() == getattr(two, name).tobytes()
+
+
+def test_one_that_does_nothing_wrong_gives_the_numbers_that_it_gives_in_this_process(plugin, mission, monkeypatch):
+    steps = []
+    apart = run_estimator(mission, "dead-reckoning", progress=lambda *step: steps.append(step))
+    monkeypatch.setattr("sonar_graph.estimator.DISTRIBUTION", "another name of this package")
+    assert is_foreign("dead-reckoning")
+    told = []
+    here = run_estimator(mission, "dead-reckoning", progress=lambda *step: told.append(step))
+    assert here.causal.positions.tobytes() == apart.causal.positions.tobytes()
+    assert told == steps
+    with pytest.raises(EstimatorError, match=r"settings of dead-reckoning: \w+.* no such"):
+        check_request("dead-reckoning", {"wrong": 1})
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("exits", r"s after the start .*: it called sys\.exit\(3\)"),
+        ("exitsatonce", "its process ended with code 4"),
+        ("aborts", "its process was ended by SIGABRT"),
+        ("interrupts", "KeyboardInterrupt: of its own"),
+    ],
+)
+def test_the_end_of_a_process_is_the_failure_of_its_run_alone(plugin, mission, name, reason):
+    comparison = compare(mission, [f"their-{name}", "dead-reckoning"])
+    assert [run.status for run in comparison.runs] == ["failed", "ok"]
+    assert __import__("re").search(reason, comparison.runs[0].reason)
+
+
+def test_sys_exit_while_it_is_loaded_is_told_as_such(plugin, mission, monkeypatch):
+    monkeypatch.setenv("SONAR_GRAPH_MEDDLES", "1")
+    check_request("their-exits")
+    run = run_estimator(mission, "their-exits")
+    assert (run.status, "it calls sys.exit(7)" in run.reason) == ("failed", True)

@@ -1,0 +1,187 @@
+"""Nothing of the user's is lost: files of others, links, pipes, a second command, an end in the middle."""
+
+import errno
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from sonar_graph.errors import EvaluationError
+from sonar_graph.files import replacing, result_folder, result_written, write_json, written_whole
+
+KIND = "comparison"
+
+
+def write(
+    folder: Path, contents: dict[str, str], *, overwrite: bool = False, error: type[BaseException] | None = None
+) -> None:
+    with result_written(folder, KIND, overwrite=overwrite) as written:
+        written.remove(written.names)
+        for name, content in contents.items():
+            with replacing(folder / name) as partial:
+                partial.write_text(content)
+        if error is not None:
+            raise error
+
+
+def contents(folder: Path) -> dict[str, str]:
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name not in (".lock", ".sonar_graph.json"))
+    return {path.relative_to(folder).as_posix(): path.read_text() for path in files}
+
+
+def test_a_result_replaces_what_an_earlier_one_wrote_and_leaves_all_else(tmp_path):
+    write(tmp_path, {"a.json": "1", "runs/x/b.json": "1", "runs/y/b.json": "1"})
+    (tmp_path / "runs" / "y" / "notes").write_text("mine")
+    write(tmp_path, {"a.json": "2", "runs/z/b.json": "2"})
+    assert contents(tmp_path) == {"a.json": "2", "runs/z/b.json": "2", "runs/y/notes": "mine"}
+    assert not (tmp_path / "runs" / "x").exists()
+
+
+@pytest.mark.parametrize("name", ["a.json", "runs/x/b.json"])
+@pytest.mark.parametrize("is_changed", [False, True])
+def test_a_file_of_others_or_one_changed_since_is_replaced_only_when_told_and_never_removed(tmp_path, name, is_changed):
+    new = {"a.json": "2", "runs/x/b.json": "2"}
+    if is_changed:
+        write(tmp_path, dict.fromkeys(new, "1"))
+    (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / name).write_text("mine")
+    before = contents(tmp_path)
+    with pytest.raises(EvaluationError, match=rf"holds {name}, which sonar-graph did not write .*--overwrite"):
+        write(tmp_path, new)
+    assert contents(tmp_path) == before
+    write(tmp_path, {other: "2" for other in new if other != name})
+    assert contents(tmp_path)[name] == "mine"
+    write(tmp_path, new, overwrite=True)
+    assert contents(tmp_path) == new
+
+
+def test_links_are_never_followed(tmp_path):
+    mine, folder = tmp_path / "mine", tmp_path / "out"
+    mine.mkdir()
+    (mine / "b.json").write_text("mine")
+    folder.mkdir()
+    (folder / "runs").symlink_to(mine)
+    for overwrite in (False, True):
+        with pytest.raises(EvaluationError, match=r"holds runs/b\.json"):
+            write(folder, {"runs/b.json": "2"}, overwrite=overwrite)
+    (folder / "c.json").symlink_to(mine / "b.json")
+    with pytest.raises(EvaluationError, match=r"holds c\.json"):
+        write(folder, {"c.json": "2"})
+    for name in (".partial-c.json", ".c.json.partial", "c.json.part"):
+        (mine / name).symlink_to(mine / "b.json")
+    write_json(mine / "c.json", {})
+    assert (mine / "b.json").read_text() == "mine"
+    assert not (folder / "b.json").exists()
+
+
+def test_a_block_that_fails_changes_nothing_and_leaves_no_temporary_file(tmp_path):
+    write(tmp_path, {"a.json": "1", "runs/x/b.json": "1"})
+    before = contents(tmp_path)
+    for error in (RuntimeError, KeyboardInterrupt):
+        with pytest.raises(error):
+            write(tmp_path, {"a.json": "half", "runs/new/c.json": "half"}, error=error)
+        assert contents(tmp_path) == before
+    with pytest.raises(RuntimeError), written_whole(tmp_path / "log.mcap"):
+        raise RuntimeError
+    assert contents(tmp_path) == before
+    assert not (tmp_path / "runs" / "new").exists()
+
+
+def test_killed_between_two_files_all_are_still_known_as_ours(tmp_path, monkeypatch):
+    write(tmp_path, {"a.json": "1", "b.json": "1"})
+    replace = Path.replace
+
+    def dies(self: Path, target: Path) -> Path:
+        if target.name == "b.json":
+            raise OSError("killed")
+        return replace(self, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", dies)
+        with pytest.raises(OSError, match="killed"):
+            write(tmp_path, {"a.json": "2", "b.json": "2"})
+    assert contents(tmp_path) in ({"a.json": "2"}, {"a.json": "2", "b.json": "1"})
+    write(tmp_path, {"a.json": "3", "b.json": "3"})
+    assert contents(tmp_path) == {"a.json": "3", "b.json": "3"}
+
+
+@pytest.mark.parametrize(
+    "manifest", ["", "[]", '{"kind": "comparison"}', '{"format": 1, "kind": "x", "files": 3}', "[" * 9999]
+)
+def test_a_manifest_that_is_not_ours_is_refused_and_nothing_outside_the_folder_is_touched(tmp_path, manifest):
+    folder = tmp_path / "out"
+    write(folder, {"a.json": "1"})
+    (folder / ".sonar_graph.json").write_text(manifest)
+    with pytest.raises(EvaluationError, match=r"\.sonar_graph\.json: is not as sonar-graph writes it"):
+        write(folder, {"a.json": "2"})
+    (tmp_path / "mine").write_text("mine")
+    for name in ("../mine", str(tmp_path / "mine")):
+        files = f'{{"{name}": ["{"0" * 32}"]}}'
+        (folder / ".sonar_graph.json").write_text(
+            f'{{"format": "sonar_graph folder 1", "kind": "comparison", "files": {files}}}'
+        )
+        with pytest.raises(EvaluationError, match="not as sonar-graph writes it"):
+            write(folder, {"a.json": "2"})
+    assert (tmp_path / "mine").read_text() == "mine"
+
+
+def test_a_folder_holds_one_kind_of_result(tmp_path):
+    write(tmp_path, {"a.json": "1"})
+    with (
+        pytest.raises(EvaluationError, match="holds a comparison, and would become a batch"),
+        result_written(tmp_path, "batch"),
+    ):
+        pass
+
+
+HOLDER = """
+import subprocess, sys, time
+from pathlib import Path
+from sonar_graph.files import result_folder
+
+with result_folder(Path(sys.argv[1]), "comparison"):
+    child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"], stdout=subprocess.DEVNULL)
+    print(child.pid, flush=True)
+    time.sleep(60)
+"""
+
+
+def test_second_process_is_refused_until_the_first_is_killed_although_its_children_live(tmp_path):
+    with subprocess.Popen([sys.executable, "-c", HOLDER, str(tmp_path)], stdout=subprocess.PIPE, text=True) as process:
+        child = int(process.stdout.readline())
+        try:
+            with pytest.raises(EvaluationError) as refused, result_folder(tmp_path, KIND):
+                pass
+            assert str(refused.value).startswith(f"{tmp_path}: another command is writing to this folder; ")
+            process.kill()
+            process.wait()
+            os.kill(child, 0)
+            with result_folder(tmp_path, KIND):
+                assert (tmp_path / ".lock").exists()
+        finally:
+            process.kill()
+            os.kill(child, 9)
+
+
+def test_a_lock_is_of_one_folder_and_ends_with_the_block_also_by_an_error(tmp_path):
+    with pytest.raises(KeyboardInterrupt), result_folder(tmp_path, KIND):
+        raise KeyboardInterrupt
+    with result_folder(tmp_path, KIND), result_folder(tmp_path / "other", KIND):
+        with pytest.raises(EvaluationError, match="another command"), result_folder(tmp_path, KIND):
+            pass
+        write(tmp_path, {"a.json": "1"})
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="other locks")
+@pytest.mark.parametrize("number", [errno.ENOSYS, errno.ENOLCK])
+def test_a_file_system_without_locks_is_refused(tmp_path, monkeypatch, number):
+    import fcntl
+
+    def no_lock(*_arguments: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(fcntl, "flock", no_lock)
+    with pytest.raises(EvaluationError, match="cannot be locked against a second"), result_folder(tmp_path, KIND):
+        pass
