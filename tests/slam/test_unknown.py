@@ -310,3 +310,13 @@ def test_a_wide_difference_says_nothing(own_sigma: float):
 def test_without_merging_they_stay_two(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(module, "nearest_duplicates", lambda *_: None)
     assert len(run(named_late(), **ASSOCIATED).landmarks()) > 4
+
+
+def test_the_first_landmark_without_a_name_is_merged_also_when_it_is_the_only_one():
+    """Its identity is the lowest that stands for no name."""
+    ids, _ = clean().detections.most_probable()
+    rows = np.flatnonzero(ids == 1)
+    sequence = anonymous_where(clean(), rows[: len(rows) // 2])
+    estimator = run(sequence, **ASSOCIATED)
+    assert Outcome.MOVED in estimator.detections().outcomes
+    assert estimator.landmarks().ids.tolist() == [1, 2, 3, 4]

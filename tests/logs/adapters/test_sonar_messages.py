@@ -8,8 +8,11 @@ import pytest
 
 from sonar_graph.errors import LogError
 from sonar_graph.images import SonarFrames
+from sonar_graph.logs.adapters.drivers import SHIPPED
 from sonar_graph.logs.adapters.log_config import read_log_config
+from sonar_graph.logs.cdr import definition, encode, parse_definition
 from sonar_graph.logs.inspection import inspect_log
+from sonar_graph.logs.mcap import Keep, Topic
 from sonar_graph.logs.reading import read_sonar_frames
 from sonar_graph.measurements import Floats
 
@@ -138,3 +141,23 @@ def test_a_real_oculus_ping_comes_out_as_its_own_header_says(foreign: Any, recor
         sum(np.abs(np.diff(f.intensity[0].astype(float), axis=axis)).mean() for axis in (0, 1)) for f in (frames, wrong)
     )
     assert right < 0.8 * other
+
+
+@pytest.mark.parametrize("bad", [[], [1], [0, 1], [3, 5], [0, 2, 3, 4, 5], [1, 2, 3]])
+def test_each_message_that_is_no_image_is_refused_once_by_its_time_of_recording(bad: list[int]) -> None:
+    """Several messages may share an instant, sound ones and others."""
+    kind = "marine_acoustic_msgs/msg/ProjectedSonarImage"
+    times_ns = np.array([10, 10, 20, 30, 30, 30])
+    values = {"ranges": np.array([RANGES]), "image.dtype": 0, "image.beam_count": 3}
+    values |= {f"beam_directions.{axis}": np.array([numbers]) for axis, numbers in zip("xyz", np.eye(3), strict=True)}
+    values |= {"image.data": np.frombuffer(ROWS, np.uint8)[None], "header.stamp.sec": 1}
+    payload = encode(parse_definition(kind, definition(kind)), 1, values, {"beam_directions": 3})[0].tobytes()
+    payloads = [payload[:-8] if row in bad else payload for row in range(len(times_ns))]
+    sizes = np.array([len(one) for one in payloads])
+    topic = Topic(Path("a.mcap"), "/sonar", kind, "cdr", "ros2msg", definition(kind), Keep.ALL)
+    topic.gather(b"".join(payloads), np.cumsum(sizes) - sizes, sizes, times_ns)
+    (adapter,) = (one.adapter for one in SHIPPED["sonar"] if one.adapter.type == kind)
+    refused: list[int] = []
+    blocks = list(adapter.read(topic, lambda stamp_ns, _: refused.append(stamp_ns)))
+    assert sorted(refused) == times_ns[bad].tolist()
+    assert sum(len(block) for block in blocks) == len(times_ns) - len(bad)
