@@ -29,6 +29,10 @@ from sonar_graph.measurements import PAUSE_NS as PAUSE_NS
 from sonar_graph.states import LandmarkMap, Refusal, RefusedRow, Trajectory
 
 
+MOST_INSTANTS = 10_000_000
+"""Two months at 2 Hz; a clock that was set meanwhile could ask for all memory."""
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Sequence:
     """Calibration, measurements in order of time, and truth where it is known.
@@ -83,12 +87,12 @@ class Sequence:
     @cached_property
     def start_ns(self) -> int:
         """First instant with IMU and DVL: the start pose of the calibration holds here."""
-        return max(_longest_part(self.imu.stamps_ns)[0], _longest_part(self.dvl.stamps_ns)[0])
+        return max(longest_part(self.imu.stamps_ns)[0], longest_part(self.dvl.stamps_ns)[0])
 
     @cached_property
     def end_ns(self) -> int:
         """Last instant with IMU and DVL."""
-        return min(_longest_part(self.imu.stamps_ns)[1], _longest_part(self.dvl.stamps_ns)[1])
+        return min(longest_part(self.imu.stamps_ns)[1], longest_part(self.dvl.stamps_ns)[1])
 
     def off_the_clock(self) -> list[RefusedRow]:
         """Rows more than a day before the start or after the end, which `replay` leaves out, or that are too fast."""
@@ -117,13 +121,19 @@ class Sequence:
         Raises
         ------
         MeasurementError
-            When the rate is not positive, or the sequence is shorter than one step.
+            When the rate is not positive, the sequence is shorter than one step, or the instants are too many.
         """
         if not 0 < rate_hz <= NS_PER_S:
             raise MeasurementError(
                 f"{rate_hz} Hz is no rate; expected more than 0, and at most one instant a nanosecond"
             )
         step_ns = round(NS_PER_S / rate_hz)
+        count = (self.end_ns - self.start_ns) // step_ns
+        if count > MOST_INSTANTS:
+            raise MeasurementError(
+                f"{self.name}: {self.duration_s:.0f} s at {rate_hz:g} Hz are {count} instants, and at most "
+                f"{MOST_INSTANTS} are asked for: read a part with --start and --end, or lower --rate-hz"
+            )
         instants = np.arange(self.start_ns + step_ns, self.end_ns + 1, step_ns, dtype=np.int64)
         if not len(instants):
             raise MeasurementError(
@@ -140,7 +150,7 @@ class Sequence:
             after_ns = end_ns
 
 
-def _longest_part(stamps_ns: Ints) -> tuple[int, int]:
+def longest_part(stamps_ns: Ints) -> tuple[int, int]:
     """First and last stamp of the part with the most rows between pauses."""
     pauses = np.flatnonzero(np.diff(stamps_ns.astype(np.float64)) > PAUSE_NS) + 1
     first, end = max(pairwise([0, *pauses.tolist(), len(stamps_ns)]), key=lambda part: part[1] - part[0])

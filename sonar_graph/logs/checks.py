@@ -15,6 +15,7 @@ from sonar_graph.calibration import HOLE_INTERVALS, ROWS_BEFORE, SHORTEST_HOLE_S
 from sonar_graph.devices import UNMEASURED_M_S
 from sonar_graph.logs.adapters import Z_DOWN_TYPES, Adapter
 from sonar_graph.measurements import Depth, Dvl, Floats, Imu, Ints
+from sonar_graph.sequence import longest_part
 
 MOST_NAMED = 3
 """Gaps or stretches of one kind that are named one by one; of more, the longest."""
@@ -205,7 +206,10 @@ def gyro_warning(imu: Imu, dvl: Dvl, calibration: Calibration) -> str | None:
     is ``u = f - dv / T - w x v``, normalised, and ``u_j = Exp(-w T) u_i`` from one second to the next. Compared is the
     median of the squared differences, over all permutations and signs of the rates. docs/theory/sensor_check.md.
     """
-    first_ns, last_ns = max(imu.stamps_ns[0], dvl.stamps_ns[0]), min(imu.stamps_ns[-1], dvl.stamps_ns[-1])
+    spans_ns = [longest_part(rows.stamps_ns) for rows in (imu, dvl)]  # a clock may have been set meanwhile
+    first_ns, last_ns = max(first for first, _ in spans_ns), min(last for _, last in spans_ns)
+    if (last_ns - first_ns) * 1e-9 > len(imu):
+        return None
     edges_s = np.arange(0.0, (last_ns - first_ns) * 1e-9, 1.0)
     if len(edges_s) < FEWEST_SECONDS or np.isnan(imu.specific_force).any():
         return None

@@ -207,6 +207,9 @@ def inspect_log(
 
 def _summarise(topic: Topic) -> TopicSummary:
     header_ns, log_times_ns = _header_stamps(topic), topic.log_times_ns
+    if not len(topic):  # none of its messages is what its definition says
+        faults = "has " + ", ".join(f"{count} messages {fault}" for fault, count in topic.unsound.items())
+        return TopicSummary(topic.name, topic.type_name, topic.encoding, 0, 0, 0, 0.0, 0.0, "log", refusal=faults)
     stamps_ns, lag_s = np.sort(log_times_ns), None
     if header_ns is not None:
         stamps_ns = np.sort(np.where(header_ns == 0, log_times_ns, header_ns))

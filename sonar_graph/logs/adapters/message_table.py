@@ -12,7 +12,9 @@ from sonar_graph.measurements import NS_PER_S, Ints
 
 Dropped = dict[str, int]
 """Number of rows left out, by reason."""
-NOT_FINITE = "with values that are not finite"
+NOT_FINITE = "with values that are not finite or beyond 1e15"
+LARGEST = 1e15
+"""No sensor gives more, in whatever unit; products of a few such numbers overflow."""
 LOG_TIME = "log"
 """Value of `Adapter.stamp` that stands for the time of recording."""
 
@@ -107,8 +109,8 @@ def nanoseconds(values: NDArray[Any], unit_s: float) -> Ints:
 
 
 def not_finite(*columns: NDArray[Any]) -> NDArray[np.bool_]:
-    """Mask of rows in which some column has a value that is not finite, shape (n,)."""
-    return ~np.all([np.isfinite(c).reshape(len(c), -1).all(axis=1) for c in columns], axis=0)
+    """Mask of rows in which some column has a value that is not finite or larger than `LARGEST`, shape (n,)."""
+    return ~np.all([(np.abs(c) < LARGEST).reshape(len(c), -1).all(axis=1) for c in columns], axis=0)
 
 
 def fit_rows(stamps_ns: Ints, faults: Mapping[str, NDArray[np.bool_]], *, unique: bool) -> tuple[Ints, Dropped]:

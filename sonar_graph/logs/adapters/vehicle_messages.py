@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation as SpatialRotation
 
 from sonar_graph.logs.adapters.adapter import Adapter, CovarianceFields, Scale, axes_matrix, field_paths, turn
 from sonar_graph.logs.adapters.aiding_messages import ENU_R_NED, GeodeticFields
-from sonar_graph.logs.adapters.message_table import NOT_FINITE, Dropped, MessageTable, fit_rows, not_finite
+from sonar_graph.logs.adapters.message_table import LARGEST, NOT_FINITE, Dropped, MessageTable, fit_rows, not_finite
 from sonar_graph.logs.geodesy import Origin
 from sonar_graph.measurements import Depth, Floats, Imu
 from sonar_graph.states import Trajectory
@@ -55,7 +55,7 @@ class ImuAdapter(Adapter):
         rate = _scaled(table.beside(self.angular_velocity), self.angular_velocity_scale)
         force = _scaled(table.beside(self.linear_acceleration), self.linear_acceleration_scale)
         unmeasured = _is_marked(table, self.linear_acceleration_status) | self._is_force_unfilled(table)
-        force = np.where(unmeasured[:, None] | ~np.isfinite(force), np.nan, force)
+        force = np.where(unmeasured[:, None] | ~(np.abs(force) < LARGEST), np.nan, force)
         faults = {"without angular rate": _is_marked(table, self.angular_velocity_status), NOT_FINITE: not_finite(rate)}
         rows, dropped = fit_rows(table.stamps_ns, faults, unique=True)
         rate, force = turn(self.rotation, rate[rows]), turn(self.rotation, force[rows])
