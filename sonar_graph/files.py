@@ -27,6 +27,7 @@ COMPARISON, BATCH = "comparison", "batch"
 """Kinds of results in the manifests of folders."""
 FORMAT = "sonar_graph folder 1"
 DIGEST_DIGITS = 32
+LARGEST_TEXT = 1 << 27
 _NAMED = 4
 """Most files that an error names."""
 _LONGEST_NAME = 100
@@ -47,6 +48,14 @@ def regular(path: Path) -> Path:
     return path
 
 
+def text_of(path: Path, encoding: str = "utf-8") -> str:
+    """Content of a text file; an OSError as of `regular`, and where it has more than `LARGEST_TEXT` bytes."""
+    if regular(path).stat().st_size > LARGEST_TEXT:
+        reason = f"it has {path.stat().st_size} bytes, and at most {LARGEST_TEXT} are read as a text: give a part of it"
+        raise OSError(errno.EFBIG, reason, str(path))
+    return path.read_text(encoding)
+
+
 class ResultFolder:
     """Folder to which this thread alone writes, as the kind of result that its manifest names.
 
@@ -65,7 +74,7 @@ class ResultFolder:
         try:
             if manifest.is_symlink():
                 raise ValueError("it is a link")
-            content = json.loads(regular(manifest).read_text("utf-8"))
+            content = json.loads(text_of(manifest))
             found, self._digests = content["kind"], content["files"]
             is_sound = all(isinstance(digests, list) and _is_below(name) for name, digests in self._digests.items())
             if content["format"] != FORMAT or not is_sound:
@@ -340,7 +349,7 @@ def read_json(path: Path) -> dict[str, Any]:
     Raises `EvaluationError` when the file is missing or is not a JSON object.
     """
     try:
-        content = json.loads(regular(path).read_text("utf-8"))
+        content = json.loads(text_of(path))
     except (OSError, ValueError, RecursionError) as error:
         raise EvaluationError(f"{path}: cannot be read as JSON ({error}); write the comparison anew") from error
     if not isinstance(content, dict):

@@ -4,6 +4,7 @@ import bz2
 import json
 import os
 import struct
+import tempfile
 import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -388,8 +389,6 @@ def recordings_of_sonars(_log: SoundLog, folder: Path, rng: Rng) -> Case:
 
 def bag_chunk(rng: Rng) -> bytes:
     """A ROS 1 bag of one chunk of many zeros."""
-    import tempfile
-
     from rosbags.rosbag1 import Writer
     from rosbags.typesys import Stores, get_typestore
 

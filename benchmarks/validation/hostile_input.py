@@ -29,6 +29,7 @@ from collections import Counter, defaultdict
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from unicodedata import category
 
 import numpy as np
 
@@ -46,7 +47,6 @@ from sonar_graph.simulation import BasinOptions, simulate_basin
 
 TIME_LIMIT_S = 10.0
 MOST_RSS_MB = 1500.0
-ALLOWED = set(range(32, 127)) | {9, 10}
 TARGETS = {"tracebacks": 0, "hangs": 0, "silent_errors": 0, "files_lost": 0, "interrupts_missed": 0}
 
 
@@ -72,7 +72,7 @@ class Outcome:
     def has_escapes(self) -> bool:
         """True for characters that a terminal obeys; what is printed is UTF-8."""
         said = (self.out + self.err).decode("utf-8", "replace")
-        return any(not char.isprintable() and char not in "\n\t" for char in said)
+        return any(category(char) in ("Cc", "Cf", "Cs", "Zl", "Zp") and char not in "\n\t" for char in said)
 
 
 def digest(sequence: Sequence) -> str:

@@ -37,7 +37,7 @@ from pydantic import BeforeValidator, Field, ValidationError, field_validator, m
 from sonar_graph.calibration import Section
 from sonar_graph.errors import BatchError
 from sonar_graph.evaluation import SCORES
-from sonar_graph.files import regular
+from sonar_graph.files import text_of
 from sonar_graph.settings import choice, faults_in, flattened
 
 Place = tuple[int | str, ...]
@@ -190,7 +190,7 @@ def read_suite(path: Path) -> SuiteFile:
         When it cannot be read, is no TOML, or a value is missing, unknown or does not fit.
     """
     try:
-        text = regular(path).read_text(encoding="utf-8")
+        text = text_of(path)
         values = tomllib.loads(text)
     except (OSError, UnicodeDecodeError) as error:
         raise BatchError(f"{path}: cannot be read: {error}") from error

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, is_dataclass
 from functools import wraps
 from inspect import Parameter, Signature, signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_type_hints
+from unicodedata import category
 
 import typer
-from rich.console import Console
-from rich.text import Text
+from rich.console import Console, ConsoleOptions
+from rich.segment import Segment
 
 from sonar_graph.errors import EstimatorError, LogError
 
@@ -251,8 +252,14 @@ def examples(*commands: str) -> str:
 
 def printable(text: str) -> str:
     """Text without what a terminal would obey: names in a log may hold escape sequences, which are spelt out."""
+    if text.isprintable():
+        return text
     return "".join(
-        char if char.isprintable() or char in "\n\t" else f"\\u{ord(char):04x}" if ord(char) < 0x10000 else "?"
+        char
+        if char in "\n\t" or category(char)[0] not in "CZ" or category(char) == "Zs"
+        else f"\\u{ord(char):04x}"
+        if ord(char) < 0x10000
+        else "?"
         for char in text
     )
 
@@ -265,9 +272,10 @@ def echo(text: str, *, err: bool = False, nl: bool = True) -> None:
 class PlainConsole(Console):
     """Console for texts that may hold names of a log."""
 
-    def render_str(self, text: str, **options: Any) -> Text:
-        """Text of a cell or line, without what a terminal would obey."""
-        return super().render_str(printable(text), **options)
+    def render(self, renderable: Any, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        """Pieces of a text, table or anything else, without what a terminal would obey in them."""
+        for piece in super().render(renderable, options):
+            yield piece if piece.control else piece._replace(text=printable(piece.text))
 
 
 def answers() -> Console:

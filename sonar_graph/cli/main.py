@@ -5,6 +5,8 @@ reference; 2 a mistake of the user, reported in one line on stderr; 130 interrup
 traceback.
 """
 
+import contextlib
+import os
 import signal
 import sys
 from collections.abc import Sequence
@@ -93,6 +95,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         signal.signal(signal.SIGINT, end_at_once)
     if code == INTERRUPTED:  # typer turns Ctrl-C into this code without a word
         _complain("interrupted", INTERRUPTED)
+    if arguments is None and sys.getprofile() is sys.gettrace() is None:
+        with contextlib.suppress(OSError):  # nobody reads it any more
+            sys.stdout.flush()
+        os._exit(int(code or 0))  # the ordinary end takes a while, in which a Ctrl-C would have the last word
     sys.exit(int(code or 0))
 
 

@@ -35,7 +35,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from sonar_graph.calibration import Section
 from sonar_graph.errors import CalibrationError
-from sonar_graph.files import regular
+from sonar_graph.files import text_of
 from sonar_graph.measurements import Floats
 from sonar_graph.settings import faults_in
 
@@ -220,7 +220,7 @@ def load_designs(path: Path) -> tuple[LandmarkDesign, ...]:
 def _landmark_tables(file: Path) -> list[dict[str, Any]]:
     """The ``[[landmark]]`` tables of a TOML file."""
     try:
-        values = tomllib.loads(regular(file).read_text(encoding="utf-8"))
+        values = tomllib.loads(text_of(file))
     except OSError as error:
         raise CalibrationError(f"{file} cannot be read: {error.strerror}") from error
     except (ValueError, RecursionError) as error:

@@ -207,7 +207,7 @@ def gyro_warning(imu: Imu, dvl: Dvl, calibration: Calibration) -> str | None:
     median of the squared differences, over all permutations and signs of the rates. docs/theory/sensor_check.md.
     """
     spans_ns = [longest_part(rows.stamps_ns) for rows in (imu, dvl)]  # a clock may have been set meanwhile
-    first_ns, last_ns = max(first for first, _ in spans_ns), min(last for _, last in spans_ns)
+    first_ns, last_ns = np.int64(max(first for first, _ in spans_ns)), min(last for _, last in spans_ns)
     if (last_ns - first_ns) * 1e-9 > len(imu):
         return None
     edges_s = np.arange(0.0, (last_ns - first_ns) * 1e-9, 1.0)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from sonar_graph.errors import LogError
-from sonar_graph.files import regular, replacing
+from sonar_graph.files import regular, replacing, text_of
 from sonar_graph.measurements import NS_PER_S
 from sonar_graph.states import LandmarkMap, Trajectory
 
@@ -58,7 +58,7 @@ def read_tum(path: Path) -> Trajectory:
     Raises `LogError` naming the line that is not a pose; or when the file cannot be read or its stamps do not increase.
     """
     try:
-        lines = regular(Path(path)).read_text(encoding="utf-8").splitlines()
+        lines = text_of(Path(path)).splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise LogError(f"{path} cannot be read as a text file: {error}") from error
     stamps, poses = [], []

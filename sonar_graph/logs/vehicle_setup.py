@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration, Mounting, Start
 from sonar_graph.errors import CalibrationError, LogError
-from sonar_graph.files import regular
+from sonar_graph.files import text_of
 from sonar_graph.logs.cdr import Bytes, Value, definition, encode, parse_definition, short_name
 from sonar_graph.logs.mcap import Keep, Recording, scan
 from sonar_graph.logs.roles import TF
@@ -155,7 +155,7 @@ class PartialCalibration:
         """
         kind = "JSON" if path.suffix == ".json" else "TOML"
         try:
-            text = regular(path).read_text(encoding="utf-8")
+            text = text_of(path)
             values = json.loads(text) if kind == "JSON" else tomllib.loads(text)
         except OSError as error:
             raise CalibrationError(f"{path}: cannot be read: {error.strerror}") from error

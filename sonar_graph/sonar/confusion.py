@@ -24,7 +24,7 @@ from pydantic import Field, ValidationError, model_validator
 from sonar_graph.calibration import Section
 from sonar_graph.devices import LandmarkDesign
 from sonar_graph.errors import CalibrationError
-from sonar_graph.files import regular
+from sonar_graph.files import text_of
 from sonar_graph.measurements import Floats
 from sonar_graph.settings import faults_in
 
@@ -154,7 +154,7 @@ def read_confusion(path: Path) -> Confusion:
         When the file is not JSON or not such a model, naming the field.
     """
     try:
-        return Confusion.model_validate(json.loads(regular(path).read_text(encoding="utf-8")))
+        return Confusion.model_validate(json.loads(text_of(path)))
     except OSError as error:
         raise CalibrationError(f"{path} cannot be read: {error.strerror}") from error
     except ValidationError as error:

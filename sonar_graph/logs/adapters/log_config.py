@@ -22,7 +22,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from sonar_graph.errors import LogError
-from sonar_graph.files import regular
+from sonar_graph.files import text_of
 from sonar_graph.logs.adapters.adapter import Adapter, leaf_fields
 from sonar_graph.logs.adapters.aiding_messages import HeadingAdapter, PositionAdapter
 from sonar_graph.logs.adapters.drivers import SHIPPED
@@ -173,7 +173,7 @@ def read_log_config(path: Path) -> LogConfig:
     A LogError where it cannot be read, is not TOML, or says something that cannot be; it names table and key.
     """
     try:
-        values = tomllib.loads(regular(Path(path)).read_text(encoding="utf-8"))
+        values = tomllib.loads(text_of(Path(path)))
     except OSError as error:
         raise LogError(f"{path} cannot be read: {error.strerror}") from error
     except (ValueError, RecursionError) as error:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from sonar_graph.errors import DatasetError
-from sonar_graph.files import regular
+from sonar_graph.files import text_of
 from sonar_graph.logs.trajectory_files import decimal_ns
 from sonar_graph.measurements import Floats, Ints
 
@@ -68,7 +68,7 @@ def read_lines(
     there.
     """
     try:
-        lines = regular(path).read_text(encoding).splitlines()
+        lines = text_of(path, encoding).splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(
             f"{path}: cannot be read as text ({getattr(error, 'strerror', None) or error}); expected {expected}"
