@@ -254,14 +254,8 @@ def printable(text: str) -> str:
     """Text without what a terminal would obey: names in a log may hold escape sequences, which are spelt out."""
     if text.isprintable():
         return text
-    return "".join(
-        char
-        if char in "\n\t" or category(char)[0] not in "CZ" or category(char) == "Zs"
-        else f"\\u{ord(char):04x}"
-        if ord(char) < 0x10000
-        else "?"
-        for char in text
-    )
+    obeyed = {char for char in set(text) - {"\n", "\t"} if category(char) in ("Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp")}
+    return text.translate({ord(char): f"\\u{ord(char):04x}" for char in obeyed})
 
 
 def echo(text: str, *, err: bool = False, nl: bool = True) -> None:

@@ -207,13 +207,13 @@ def gyro_warning(imu: Imu, dvl: Dvl, calibration: Calibration) -> str | None:
     median of the squared differences, over all permutations and signs of the rates. docs/theory/sensor_check.md.
     """
     spans_ns = [longest_part(rows.stamps_ns) for rows in (imu, dvl)]  # a clock may have been set meanwhile
-    first_ns, last_ns = np.int64(max(first for first, _ in spans_ns)), min(last for _, last in spans_ns)
+    first_ns, last_ns = max(first for first, _ in spans_ns), min(last for _, last in spans_ns)
     if (last_ns - first_ns) * 1e-9 > len(imu):
         return None
     edges_s = np.arange(0.0, (last_ns - first_ns) * 1e-9, 1.0)
     if len(edges_s) < FEWEST_SECONDS or np.isnan(imu.specific_force).any():
         return None
-    imu_s, dvl_s = ((rows.stamps_ns - first_ns) * 1e-9 for rows in (imu, dvl))
+    imu_s, dvl_s = (np.asarray((rows.stamps_ns - first_ns) * 1e-9, np.float64) for rows in (imu, dvl))
     body_R_imu, body_R_dvl = (part.mounting.pose().rotation().matrix() for part in (calibration.imu, calibration.dvl))
     means = []
     for values in (imu.angular_velocity, imu.specific_force):

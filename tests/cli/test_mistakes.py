@@ -38,6 +38,7 @@ def files(lane, lane_log, basin_content, tmp_path_factory) -> Path:
         "killed/.sonar_graph.json": '{"format": "sonar_graph folder 1", "kind": "batch", "files": {}}',
     }
     (folder / "killed").mkdir()
+    texts["killed/.lock"] = ""
     for name, text in texts.items():
         (folder / name).write_text(text)
     (folder / "empty").mkdir()
