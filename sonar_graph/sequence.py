@@ -135,6 +135,10 @@ class Sequence:
                 f"{MOST_INSTANTS} are asked for: read a part with --start and --end, or lower --rate-hz"
             )
         instants = np.arange(self.start_ns + step_ns, self.end_ns + 1, step_ns, dtype=np.int64)
+        if self.end_ns < self.start_ns:
+            raise MeasurementError(
+                f"{self.name}: the rows of IMU and DVL have no time in common: of two clocks, or of one that was set?"
+            )
         if not len(instants):
             raise MeasurementError(
                 f"{self.name}: {self.duration_s:.3f} s with IMU and DVL are too short for {rate_hz} Hz"

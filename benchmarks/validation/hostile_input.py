@@ -45,7 +45,7 @@ from sonar_graph.report.rendering import csv_text
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import BasinOptions, simulate_basin
 
-TIME_LIMIT_S = 10.0
+TIME_LIMIT_S, INTERRUPT_S = 10.0, 30.0
 MOST_RSS_MB = 1500.0
 TARGETS = {"tracebacks": 0, "hangs": 0, "silent_errors": 0, "files_lost": 0, "interrupts_missed": 0}
 
@@ -193,7 +193,7 @@ def interrupts(folder: Path, count: int, rng: np.random.Generator) -> Counter[st
                 continue
             process.send_signal(signal.SIGINT)
             try:
-                _, said = process.communicate(timeout=TIME_LIMIT_S)
+                _, said = process.communicate(timeout=INTERRUPT_S)
             except subprocess.TimeoutExpired:
                 process.kill()
                 said = b"it did not end"

@@ -19,8 +19,14 @@ from sonar_graph.batch.result_table import write_results
 from sonar_graph.batch.store import SUITE, Limits, PlannedRun, Progress, Row, RunOutcome, Store, Where
 from sonar_graph.batch.suite import SuiteFile, read_suite
 from sonar_graph.errors import BatchError
-from sonar_graph.files import BATCH, replacing, result_folder, result_written
-from sonar_graph.interrupts import deferred_interrupt, terminations_as_interrupts
+from sonar_graph.files import (
+    BATCH,
+    deferred_interrupt,
+    replacing,
+    result_folder,
+    result_written,
+    terminations_as_interrupts,
+)
 
 NEEDED_PACKAGES = ("distributed", "pyarrow")
 INSTALL = "pip install 'sonar-graph[bench]'"

@@ -1,7 +1,7 @@
 """One run of a batch: sequence, estimator, scores; files as `compare` writes them, and a row.
 
 ``python -m sonar_graph.batch.one_run`` is the process that does runs, one after the other
-(`sonar_graph.evaluation.own_process`). Everything printed, also by native code, is the run's log.
+(`sonar_graph.files.own_process`). Everything printed, also by native code, is the run's log.
 """
 
 import json
@@ -27,17 +27,14 @@ from sonar_graph.errors import BatchError, EstimatorError
 from sonar_graph.estimator import load_estimator
 from sonar_graph.evaluation import (
     LIBRARIES,
-    READY,
     Comparison,
-    Tell,
     describe_environment,
     judge,
     one_line,
     run_estimator,
-    serve,
     write_comparison,
 )
-from sonar_graph.files import LOCK, MANIFEST
+from sonar_graph.files import LOCK, MANIFEST, READY, Tell, serve
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import LandmarkOptions, add_landmarks
 

@@ -194,7 +194,7 @@ def read_suite(path: Path) -> SuiteFile:
         values = tomllib.loads(text)
     except (OSError, UnicodeDecodeError) as error:
         raise BatchError(f"{path}: cannot be read: {error}") from error
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise BatchError(f"{path}: not TOML: {error}") from error
     try:
         suite = Suite.model_validate(values)

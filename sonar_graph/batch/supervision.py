@@ -18,7 +18,8 @@ import psutil
 
 from sonar_graph.batch.store import Limits, PlannedRun, Preparation, Row, RunOutcome
 from sonar_graph.errors import BatchError
-from sonar_graph.evaluation import READY, KilledError, OwnProcess, describe_environment
+from sonar_graph.evaluation import describe_environment
+from sonar_graph.files import READY, KilledError, OwnProcess
 
 ONE_THREAD = (
     *("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"),

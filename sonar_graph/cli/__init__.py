@@ -1,7 +1,7 @@
 """Commands of ``sonar-graph``, a module each; `main` starts them."""
 
 # fmt: off
-from sonar_graph.interrupts import loading
+from sonar_graph.files import loading
 
 with loading():  # a Ctrl-C meanwhile ends without a traceback
     from sonar_graph.cli.main import main

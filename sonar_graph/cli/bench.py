@@ -13,7 +13,7 @@ from typer.core import TyperGroup
 
 from sonar_graph.cli.arguments import OutputFolder, Overwrite, echo, examples
 from sonar_graph.cli.outputs import progress_bars, working, writable_json
-from sonar_graph.interrupts import INTERRUPTED
+from sonar_graph.files import INTERRUPTED
 
 if TYPE_CHECKING:
     from sonar_graph.batch import GateVerdict

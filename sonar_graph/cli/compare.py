@@ -242,6 +242,7 @@ def compare_log(
     """Read a log, recognise landmarks if it needs that, and compare estimators."""
     from sonar_graph.diagnosis import wrong_units
     from sonar_graph.evaluation import compare as compare_runs
+    from sonar_graph.evaluation import expense
     from sonar_graph.logs.adapters import LogConfig
     from sonar_graph.recognition import no_images, with_detections
 
@@ -260,6 +261,8 @@ def compare_log(
         if recognition.designs is None:
             warn_of_other_designs(sequence)
         sequence = with_detections(sequence, found)
+    if said := expense(sequence):
+        echo(f"A large log, {said}", err=True)
     with progress_bars() as progress:
         comparison = compare_runs(sequence, names, overrides, rate_hz=rate_hz, progress=progress)
     return replace(comparison, recognition=found)

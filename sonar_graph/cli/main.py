@@ -22,7 +22,7 @@ from sonar_graph.cli.inspect_log import inspect
 from sonar_graph.cli.recognise import calibrate, recognise
 from sonar_graph.cli.simulate import worlds
 from sonar_graph.errors import SonarGraphError
-from sonar_graph.interrupts import INTERRUPTED, end_at_once, noticed_interrupts
+from sonar_graph.files import INTERRUPTED, end_at_once, noticed_interrupts
 from sonar_graph.version import __version__
 
 MISTAKE = 2

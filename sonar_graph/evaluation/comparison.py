@@ -11,6 +11,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation.consistency import error_series
 from sonar_graph.evaluation.own_map import shared_map_instants
@@ -30,6 +32,8 @@ from sonar_graph.states import Trajectory
 from sonar_graph.version import __version__
 
 LIBRARIES = ("gtsam", "numpy", "scipy", "numba")
+IMU_ROW_S, MEMORY_BYTES_S, LONG_S = 3e-5, 1e10, 30.0
+"""Time for a row of the IMU, speed of memory, and what is worth a word before a comparison begins."""
 LEAST_INSTANTS = 2
 """Fewer scored instants than this make no trajectory."""
 
@@ -122,6 +126,27 @@ def compare(
         told = None if progress is None else partial(progress, name)
         runs.append(run_estimator(sequence, name, settings.get(name), instants_ns=instants_ns, progress=told))
     return judge(sequence, instants_ns, runs)
+
+
+def expense(sequence: Sequence) -> str:
+    """Sentence with what a large sequence takes at least; empty for one that takes little.
+
+    Each estimator needs some `IMU_ROW_S` for a row. One that keeps the joint covariance of n landmarks has d² numbers,
+    ``d = 3 n + 15``, and goes over them twice for each detection.
+    """
+    rows, detections = len(sequence.imu), sequence.detections
+    said = [f"{rows} IMU rows, about {rows * IMU_ROW_S / 60:.0f} min"] if rows * IMU_ROW_S > LONG_S else []
+    if detections is not None and len(detections):
+        ids = detections.candidate_ids
+        count = len(np.unique(ids[ids >= 0]))
+        covariance_bytes = 8.0 * (3 * count + 15) ** 2
+        seconds = 2 * covariance_bytes * len(detections) / MEMORY_BYTES_S
+        if seconds > LONG_S:
+            said.append(
+                f"{count} landmark identities in {len(detections)} detections, at least {covariance_bytes / 1e9:.1f} "
+                f"GB and {seconds / 60:.0f} min where an estimator keeps their joint covariance"
+            )
+    return f"for each estimator: {'; '.join(said)}" if said else ""
 
 
 def judge(sequence: Sequence, instants_ns: Ints, runs: list[RunResult]) -> Comparison:

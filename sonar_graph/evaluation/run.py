@@ -20,10 +20,9 @@ from numpy.typing import NDArray
 from sonar_graph.calibration import Section
 from sonar_graph.errors import EstimatorError, EvaluationError, UnknownEstimatorError
 from sonar_graph.estimator import Estimator, is_foreign, load_estimator, make_params, refused_rows_of, withheld_of
-from sonar_graph.evaluation.own_process import KilledError, OwnProcess, Tell, serve
 from sonar_graph.evaluation.results import MapSoFar, RunResult
 from sonar_graph.evaluation.scored_instants import kept_map_instants
-from sonar_graph.interrupts import noticed_interrupts
+from sonar_graph.files import KilledError, OwnProcess, Tell, noticed_interrupts, serve
 from sonar_graph.measurements import Floats, Ints, LandmarkDetections, Measurements
 from sonar_graph.sequence import Sequence, require_sequence
 from sonar_graph.states import Estimate, LandmarkMap, RefusedRow, Trajectory
@@ -366,6 +365,7 @@ class _Replay:
             estimator = self._fresh(kind)
             for step in self._steps[: min(last, MAX_WARM_UP_STEPS) + 1]:
                 estimator.process(copy.deepcopy(step))
+                self._check_interrupt()
 
     def _process(self, estimator: Estimator, progress: Callable[[int, int], None] | None) -> None:
         from sonar_graph.numerics import compiling_s  # loads numba, which an estimator needs and a result does not

@@ -23,7 +23,7 @@ from sonar_graph.batch.result_table import RESULTS, is_timing
 from sonar_graph.batch.store import Limits, PlannedRun, Progress, RunOutcome, Store, Where
 from sonar_graph.batch.suite import read_suite
 from sonar_graph.errors import BatchError, EvaluationError
-from sonar_graph.interrupts import deferred_interrupt, noticed_interrupts, terminations_as_interrupts
+from sonar_graph.files import deferred_interrupt, noticed_interrupts, terminations_as_interrupts
 
 from .conftest import BASIN, DEAD_RECKONING, HEADER
 

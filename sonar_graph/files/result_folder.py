@@ -1,4 +1,4 @@
-"""Files: inputs that end, atomic writing, folders of results, and JSON without NaN or infinity.
+"""Atomic writing, and folders of results.
 
 A folder of results has a manifest, ``.sonar_graph.json``, with the digest of every file in it that this package wrote.
 Only these are replaced or removed, and only while they are as they were written. All files of a result change together,
@@ -6,10 +6,8 @@ when it is complete. Temporary files are new ones with random names, so that no 
 """
 
 import contextlib
-import errno
 import hashlib
 import json
-import math
 import os
 import secrets
 import sys
@@ -20,40 +18,17 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from sonar_graph.errors import EvaluationError, LogError, SonarGraphError
-from sonar_graph.interrupts import deferred_interrupt
+from sonar_graph.files.inputs import read_json, strict_json, text_of
+from sonar_graph.files.interrupts import deferred_interrupt
 
 MANIFEST, LOCK = ".sonar_graph.json", ".lock"
 COMPARISON, BATCH = "comparison", "batch"
 """Kinds of results in the manifests of folders."""
 FORMAT = "sonar_graph folder 1"
 DIGEST_DIGITS = 32
-LARGEST_TEXT = 1 << 27
 _NAMED = 4
 """Most files that an error names."""
 _LONGEST_NAME = 100
-
-
-def as_path(value: object, call: str) -> Path:
-    """An argument as a path; a TypeError that names the expected ``call`` where it is none."""
-    if not isinstance(value, str | Path):
-        raise TypeError(f"{call}: expected a path, a str or Path, not {type(value).__name__}")
-    return Path(value)
-
-
-def regular(path: Path) -> Path:
-    """The same path; an OSError where it is a pipe, a socket or a device, from which reading may never return."""
-    if path.exists() and not path.is_file() and not path.is_dir():
-        reason = "it is a pipe, a socket or a device, and reading it may never end: copy what it gives into a file"
-        raise OSError(errno.EINVAL, reason, str(path))
-    return path
-
-
-def text_of(path: Path, encoding: str = "utf-8") -> str:
-    """Content of a text file; an OSError as of `regular`, and where it has more than `LARGEST_TEXT` bytes."""
-    if regular(path).stat().st_size > LARGEST_TEXT:
-        reason = f"it has {path.stat().st_size} bytes, and at most {LARGEST_TEXT} are read as a text: give a part of it"
-        raise OSError(errno.EFBIG, reason, str(path))
-    return path.read_text(encoding)
 
 
 class ResultFolder:
@@ -336,35 +311,6 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
     """Write JSON atomically; NaN and infinity become null."""
     with replacing(path) as partial:
         partial.write_text(strict_json(content) + "\n", "utf-8")
-
-
-def strict_json(content: dict[str, Any]) -> str:
-    """JSON text; NaN and infinity become null."""
-    return json.dumps(_strict(content), indent=2, allow_nan=False, ensure_ascii=False)
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """JSON object in a file.
-
-    Raises `EvaluationError` when the file is missing or is not a JSON object.
-    """
-    try:
-        content = json.loads(text_of(path))
-    except (OSError, ValueError, RecursionError) as error:
-        raise EvaluationError(f"{path}: cannot be read as JSON ({error}); write the comparison anew") from error
-    if not isinstance(content, dict):
-        raise EvaluationError(f"{path}: expected a JSON object, found {type(content).__name__}")
-    return content
-
-
-def _strict(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {str(key): _strict(inner) for key, inner in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_strict(inner) for inner in value]
-    if isinstance(value, float):
-        return float(value) if math.isfinite(value) else None
-    return value
 
 
 @contextmanager
