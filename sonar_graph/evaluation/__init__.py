@@ -8,8 +8,8 @@ from sonar_graph.evaluation.digits import ABSENT, between, fixed, format_value, 
 from sonar_graph.evaluation.ensemble import run_ensembles
 from sonar_graph.evaluation.metrics import landmark_errors, rmse, scored_map, yaw_rad
 from sonar_graph.evaluation.own_map import own_map_errors
-from sonar_graph.evaluation.results import (
-    MOST_ROWS_NAMED, Comparison, Ensemble, ErrorSeries, RefusedRows, RunResult, Score, gathered)
+from sonar_graph.evaluation.results import (MOST_ROWS_NAMED, Comparison, Ensemble, ErrorSeries, RefusedRows, RunResult,
+    Score, gathered)
 from sonar_graph.evaluation.run import check_request, one_line, run_estimator, settings_of_request
 from sonar_graph.evaluation.scored_instants import (
     DURATION_S, MAP_TIMES_S, RETURN_M, map_instants, published_maps, repeats_published)

@@ -235,7 +235,7 @@ def _process() -> Iterator[OwnProcess]:
 def _asked(process: OwnProcess, request: _Request, progress: Callable[[int, int], None] | None) -> Any:
     process.answer()  # that it is ready
     process.send(request)
-    while isinstance(answer := process.answer(), _Progress):
+    while isinstance(answer := process.answer(), _StepsDone):
         if progress:
             progress(*answer)
     return None if answer == NOTHING else answer
@@ -250,7 +250,7 @@ def _run_apart(request: _Request, progress: Callable[[int, int], None] | None) -
         return result
 
 
-class _Progress(NamedTuple):
+class _StepsDone(NamedTuple):
     done: int
     total: int
 
@@ -275,7 +275,7 @@ def _answer(request: _Request, tell: Tell) -> object:
         instants_ns=request.instants_ns,
         interim_maps=request.interim_maps,
         is_apart=True,
-        progress=lambda done, total: tell(_Progress(done, total)),
+        progress=lambda done, total: tell(_StepsDone(done, total)),
     )
 
 
