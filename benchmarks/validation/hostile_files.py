@@ -439,7 +439,7 @@ def folders(log: SoundLog, folder: Path, rng: Rng) -> Case:
     precious = elsewhere / "precious"
     precious.write_text("mine")
     protected = [precious]
-    ours = rng.choice(OURS, int(rng.integers(0, 3)), replace=False).tolist()
+    ours = rng.choice(OURS, int(max(rng.integers(-2, 3), 0)), replace=False).tolist()
     for name in [*ours, *rng.choice(THEIRS, int(rng.integers(1, 5)), replace=False).tolist()]:
         path = out / name
         if rng.random() < 0.1 and "/" in name and not path.parent.exists():

@@ -9,7 +9,8 @@ note says so; control characters on the terminal; and cells of a table that a sp
 ``files_lost`` are users' files that are not as they were. ``peak_rss_mb`` is the largest of all commands.
 
 Interrupts are SIGINT at random moments of ``sonar-graph compare`` on a log with gaps; ``interrupts_missed`` are those
-that do not end with "interrupted", exit code 130, and no file in the folder, or in time.
+that do not end with "interrupted", exit code 130, and no file in the folder or all of them; ``interrupts_late`` came
+when all was done.
 """
 
 import csv
@@ -184,7 +185,9 @@ def interrupts(folder: Path, count: int, rng: np.random.Generator) -> Counter[st
     subprocess.run([*command, str(folder / "whole")], check=True, capture_output=True)
     whole_s = time.monotonic() - began
     note(f"a comparison takes {whole_s:.1f} s")
-    for number in range(count):
+    for number in range(2 * count):
+        if verdict["interrupts"] == count:
+            break
         out, after_s = folder / f"interrupted{number}", rng.uniform(0.1, 0.97) * whole_s
         with subprocess.Popen([*command, str(out)], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
             time.sleep(after_s)
@@ -200,6 +203,9 @@ def interrupts(folder: Path, count: int, rng: np.random.Generator) -> Counter[st
         files = [path.name for path in out.rglob("*") if path.is_file()]
         is_whole = "comparison.json" in files and not any("partial" in name for name in files)
         is_sound = process.returncode == 130 and said.splitlines()[-1:] == [b"sonar-graph: interrupted"]
+        if process.returncode == 0 and is_whole:  # it came while the process was already leaving
+            verdict["interrupts_late"] += 1
+            continue
         verdict["interrupts"] += 1
         if not is_sound or not (is_whole or not files):
             verdict["interrupts_missed"] += 1

@@ -36,7 +36,7 @@ from sonar_graph.batch.suite import LogEntry, Place, SuiteFile
 from sonar_graph.calibration import Section
 from sonar_graph.errors import BatchError, EstimatorError, SonarGraphError, UnknownEstimatorError
 from sonar_graph.estimator import installed_estimators, is_foreign, load_estimator
-from sonar_graph.evaluation import LIBRARIES, settings_of_request
+from sonar_graph.evaluation import LIBRARIES, check_request
 from sonar_graph.settings import faults_in, field_place, flattened, nested
 from sonar_graph.simulation import LandmarkOptions
 from sonar_graph.version import __version__
@@ -143,7 +143,7 @@ def contestants_of(file: SuiteFile) -> list[_Contestant]:
                 values = _validated(file, place, model, given, table).model_dump(mode="json")
             elif foreign:
                 try:
-                    values = settings_of_request(entry.name, given) or given
+                    values = check_request(entry.name, given) or given
                 except EstimatorError as error:
                     file.refuse((*place, "params" if entry.params else "name"), str(error))
             variant = _label(entry.variant, chosen) or DEFAULT_VARIANT

@@ -150,7 +150,7 @@ def demo(output: OutputFolder = Path("demo"), overwrite: Overwrite = False) -> N
     from sonar_graph.simulation import BasinOptions
 
     names = DEFAULT_ESTIMATORS.split(",")
-    with writable_folder(output, result_names(names), overwrite=overwrite):
+    with writable_folder(output, names_written(names), overwrite=overwrite):
         log = writable_log(output / LOG, overwrite=overwrite)
     options = BasinOptions.model_validate(DEMO)
     echo(f"Simulating {options.duration_s:g} s in a basin, {options.laps} laps, with sonar images: {log}")
@@ -192,11 +192,11 @@ def estimators() -> None:
         raise typer.Exit(1)
 
 
-def result_names(estimators: list[str]) -> list[str]:
+def names_written(estimators: list[str]) -> list[str]:
     """Names of the files that a comparison of some estimators may write."""
-    from sonar_graph.evaluation import written_names
+    from sonar_graph.evaluation import result_names
 
-    return [PAGE, *written_names(estimators)]
+    return [PAGE, *result_names(estimators)]
 
 
 @contextmanager
@@ -219,7 +219,7 @@ def compared(
     check_requests(names, overrides)
     sources = (log, reading.calibration, reading.log_config, recognition.designs, recognition.model)
     pictures = [path.relative_to(output).as_posix() for path in output.glob("recognised/*.jpg") if path.stem.isdigit()]
-    with writable_folder(output, [*result_names(names), *pictures], sources, overwrite=overwrite):
+    with writable_folder(output, [*names_written(names), *pictures], sources, overwrite=overwrite):
         yield compare_log(log, names, overrides, reading, recognition, rate_hz)
 
 

@@ -10,14 +10,13 @@ from sonar_graph.evaluation.metrics import landmark_errors, rmse, scored_map, ya
 from sonar_graph.evaluation.own_map import own_map_errors
 from sonar_graph.evaluation.results import (MOST_ROWS_NAMED, Comparison, Ensemble, ErrorSeries, RefusedRows, RunResult,
     Score, gathered)
-from sonar_graph.evaluation.run import check_request, one_line, run_estimator, settings_of_request
+from sonar_graph.evaluation.run import check_request, one_line, run_estimator
 from sonar_graph.evaluation.scored_instants import (
     DURATION_S, MAP_TIMES_S, RETURN_M, map_instants, published_maps, repeats_published)
 from sonar_graph.evaluation.scores import ESTIMATES
-from sonar_graph.evaluation.storage import read_comparison, write_comparison, write_viewer_files, written_names
+from sonar_graph.evaluation.storage import read_comparison, write_comparison, write_viewer_files, result_names
 from sonar_graph.evaluation.tables import (LABELS, SCORES, Cell, Column, Table, absent, as_html, count, number,
     run_columns, score_keys, score_table, text_table, words)
-
 __all__ = [
     "ABSENT", "Cell", "Column", "Comparison", "DURATION_S", "ESTIMATES", "Ensemble", "ErrorSeries", "GATED_SHARE",
     "LABELS", "LIBRARIES", "MAP_TIMES_S", "MOST_ROWS_NAMED", "NONE", "RETURN_M", "RefusedRows", "Reliability",
@@ -25,7 +24,7 @@ __all__ = [
     "check_request", "compare", "confidences", "count", "describe_environment", "expense", "fixed", "format_value",
     "gathered", "judge", "landmark_errors", "map_instants", "nis", "normalised_squares", "number", "one_line",
     "own_map_errors", "published_maps", "quantile_text", "read_comparison", "reliability_of", "repeats_published",
-    "rmse", "run_columns", "run_ensembles", "run_estimator", "score_keys", "score_table", "scored_map",
-    "settings_of_request", "supported", "text_table", "true_identities", "with_error", "words", "write_comparison",
-    "write_viewer_files", "written_names", "yaw_rad",
+    "result_names", "rmse", "run_columns", "run_ensembles", "run_estimator", "score_keys", "score_table", "scored_map",
+    "supported", "text_table", "true_identities", "with_error", "words", "write_comparison", "write_viewer_files",
+    "yaw_rad",
 ]

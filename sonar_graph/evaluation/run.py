@@ -186,20 +186,17 @@ def run_estimator(
     return replay.run(kind, progress)
 
 
-def check_request(name: str, overrides: dict[str, Any] | None = None) -> None:
-    """Raise for a name or setting that does not exist, as `run_estimator` does, without running anything."""
-    settings_of_request(name, overrides or {})
-
-
-def settings_of_request(name: str, overrides: dict[str, Any], *, is_apart: bool = False) -> dict[str, Any] | None:
+def check_request(
+    name: str, overrides: dict[str, Any] | None = None, *, is_apart: bool = False
+) -> dict[str, Any] | None:
     """All settings of an estimator with some replaced; None where it cannot be loaded, and its run will fail.
 
-    Raises `EstimatorError` for a name or setting that does not exist.
+    Raises for a name or setting that does not exist, as `run_estimator` does, without running anything.
     """
     if not is_apart and is_foreign(name):
         with _process() as process:
             try:
-                return _asked(process, _Request(name, overrides), None)
+                return _asked(process, _Request(name, overrides or {}), None)
             except KilledError:
                 return None
     try:
@@ -208,7 +205,7 @@ def settings_of_request(name: str, overrides: dict[str, Any], *, is_apart: bool 
         raise
     except EstimatorError:
         return None
-    return make_params(kind, overrides, name).model_dump(mode="json")
+    return make_params(kind, overrides or {}, name).model_dump(mode="json")
 
 
 @dataclass(frozen=True)
@@ -267,7 +264,7 @@ def _answer(request: _Request, tell: Tell) -> object:
     """In a process of its own: do a run, or give the settings of one."""
     sys.path[:] = request.path
     if request.sequence is None:
-        return settings_of_request(request.name, request.overrides, is_apart=True) or NOTHING
+        return check_request(request.name, request.overrides, is_apart=True) or NOTHING
     return run_estimator(
         request.sequence,
         request.name,

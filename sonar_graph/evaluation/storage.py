@@ -50,7 +50,7 @@ ENSEMBLES = "ensembles.json"
 ESTIMATES = ("trajectory.tum", "causal.tum", "landmarks.csv")
 
 
-def written_names(estimators: Iterable[str]) -> list[str]:
+def result_names(estimators: Iterable[str]) -> list[str]:
     """Names that a comparison of these estimators may write; pictures are named by their stamps."""
     of_runs = [f"{RUNS}/{name}/{file}" for name in estimators for file in (*ESTIMATES, SERIES, RESULT)]
     layouts = ("result.foxglove.json", "result.rviz")

@@ -159,6 +159,18 @@ def wait_a_second(_run: PlannedRun, limits: Limits) -> RunOutcome:
     return RunOutcome({"status": "ok"})
 
 
+def test_scheduler_and_workers_of_this_machine_listen_to_it_alone():
+    with execution._local_client(1) as client:
+        addresses = [client.scheduler.address, client.dashboard_link]
+        workers = client.scheduler_info()["workers"]
+        addresses += [*workers, *(worker["nanny"] for worker in workers.values())]
+        children = [psutil.Process(), *psutil.Process().children(recursive=True)]
+        listening = [c.laddr.ip for p in children for c in p.net_connections("inet") if c.status == psutil.CONN_LISTEN]
+    assert len(workers) == 1
+    assert all("://127.0.0.1:" in address for address in addresses)
+    assert set(listening) == {"127.0.0.1"}
+
+
 def test_missing_scheduler_is_one_line(write_suite, tmp_path):
     with bench(write_suite(), tmp_path / "out", "--scheduler", "tcp://127.0.0.1:9") as process:
         _, said = process.communicate(timeout=120)

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from mcap.writer import Writer
 
-from sonar_graph.cli.compare import result_names
+from sonar_graph.cli.compare import names_written
 from sonar_graph.cli.outputs import writable_folder
 from sonar_graph.errors import EvaluationError
 from sonar_graph.files import LOCK, MANIFEST
@@ -89,7 +89,7 @@ def test_a_comparison_beside_the_log_can_be_repeated_and_no_file_of_it_is_both_r
         assert run("compare", basin, "-o", tmp_path, *QUICK) == 0
     assert basin.read_bytes() == before
     written = {path for path in tmp_path.rglob("*") if path.is_file()} - {basin, tmp_path / LOCK, tmp_path / MANIFEST}
-    names = result_names(["dead-reckoning"])
+    names = names_written(["dead-reckoning"])
     assert {path.relative_to(tmp_path).as_posix() for path in written} <= set(names)
     assert len(written) > 8
     for path in written:
