@@ -7,6 +7,7 @@ the mountings of ``/tf_static``, and these before defaults (docs/design/0004-log
 from __future__ import annotations
 
 import json
+import math
 import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -68,8 +69,8 @@ def static_frames(recording: Recording) -> FrameTree:
 
 def _pose(translation_m: Floats, quaternion_wxyz: Floats) -> gtsam.Pose3 | str:
     """Pose of a transform, or its fault."""
-    length = float(np.linalg.norm(quaternion_wxyz))
-    if not (np.isfinite(length) and np.isfinite(translation_m).all()):
+    length = math.hypot(*quaternion_wxyz)
+    if not np.isfinite([*quaternion_wxyz, *translation_m]).all():
         return "has numbers that are not finite"
     if not 0.5 < length < 2.0:
         return f"has a quaternion of length {length:g}, and one of a rotation has 1"
@@ -86,8 +87,8 @@ def mounting_of(frame: str, frames: FrameTree) -> Mounting | None:
     body_T_sensor, name = gtsam.Pose3(), frame.lstrip("/")
     for _ in range(len(frames) + 1):
         if name == BODY_FRAME:
-            if not np.linalg.norm(body_T_sensor.translation()) < LARGEST_LEVER_M:
-                raise _unusable(frame, f"is {np.linalg.norm(body_T_sensor.translation()):g} m from {BODY_FRAME}")
+            if not (lever_m := math.hypot(*body_T_sensor.translation())) < LARGEST_LEVER_M:
+                raise _unusable(frame, f"is {lever_m:g} m from {BODY_FRAME}")
             x_m, y_m, z_m = body_T_sensor.translation().tolist()
             roll, pitch, yaw = body_T_sensor.rotation().rpy().tolist()
             return Mounting(translation_m=(x_m, y_m, z_m), rpy_rad=(roll, pitch, yaw))

@@ -5,8 +5,12 @@ from typing import Annotated
 import typer
 from hypothesis import given
 from hypothesis import strategies as st
+from rich.markup import escape
+from rich.table import Table
+from rich.text import Text
 from typer.testing import CliRunner
 
+from sonar_graph.cli import arguments
 from sonar_graph.cli.arguments import ReadingOptions, estimator_settings, parse_settings, with_options
 from sonar_graph.logs.vehicle_setup import PartialCalibration
 
@@ -52,3 +56,15 @@ def test_fields_of_a_group_are_options_and_those_left_out_have_their_defaults():
     assert CliRunner().invoke(app, ["a", "--start", "3", "--topic", "imu=/b"]).exit_code == 0
     assert given == ["a", ReadingOptions(topics=["imu=/b"], start="3"), 2]
     assert CliRunner().invoke(app, ["a", "--salvage"]).exit_code == 2
+
+
+def test_nothing_that_a_terminal_obeys_is_printed(capsys):
+    name = "a\x1b[2J\x9b31m\u202eb\r\x00 5 °\N{NO-BREAK SPACE}m\n"
+    arguments.echo(name)
+    table = Table("[bold]x[/]")
+    table.add_row(Text(name))
+    console = arguments.answers()
+    console.print(table, escape(name))
+    said = capsys.readouterr().out
+    assert said.count(r"a\u001b[2J\u009b31m\u202eb\u000d\u0000 5 °") == 1
+    assert not set(said) & set("\x1b\x9b\u202e\r\x00")

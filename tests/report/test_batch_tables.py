@@ -18,7 +18,7 @@ from sonar_graph.evaluation.tables import Cell, Column, Table
 from sonar_graph.report import batch_summary as summary
 from sonar_graph.report import batch_tables as tables
 from sonar_graph.report.batch_figures import consistency_drawing, difference_drawing
-from sonar_graph.report.rendering import as_csv, as_latex, latex_text, write_tables
+from sonar_graph.report.rendering import as_csv, as_latex, csv_text, latex_text, write_tables
 from tests.recorded_batches import LOGS, METRICS, changed, drawn_batch, failed, updated, with_failures, without
 
 ATE, YAW = metrics_of(["causal.ate_se2_m", "causal.yaw_rmse_rad"])
@@ -393,3 +393,10 @@ def test_the_head_shows_the_first_error_that_most_logs_have():
     assert summary.head_metric(replace(BATCH, runs=[failed(run) for run in BATCH.runs]), EVERY_METRIC) is None
     assert summary.head_metric(BATCH, metrics_of(["causal.nees_position"])) is None
     assert summary.head_metric(BATCH, metrics_of(["causal.nees_position", KEY])).name == ATE.name
+
+
+def test_no_cell_of_a_table_is_a_formula_and_numbers_stay():
+    cells = ["=1+1", "+a", "-a", "@SUM(A1)", "\t=1", "-1.5", "+2", "1e-3", "isam2", "", "a=b"]
+    assert csv_text([[cell] for cell in cells]).replace('"', "").splitlines() == [
+        *("'=1+1", "'+a", "'-a", "'@SUM(A1)", "'\t=1", "-1.5", "+2", "1e-3", "isam2", "", "a=b")
+    ]

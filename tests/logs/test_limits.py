@@ -1,0 +1,162 @@
+"""Reading ends, in time and memory that a log's size allows, whatever a file claims."""
+
+import contextlib
+import os
+import struct
+import time
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import lz4.frame
+import numpy as np
+import pytest
+import zstandard
+
+from sonar_graph.calibration import Calibration
+from sonar_graph.errors import CalibrationError, LogError
+from sonar_graph.files import text_of
+from sonar_graph.logs.cdr import parse_definition
+from sonar_graph.logs.inspection import inspect_log
+from sonar_graph.logs.mcap import Keep, chunks, reader, records
+from sonar_graph.logs.mcap.file_summary import read_summary
+from sonar_graph.logs.mcap.records import MAGIC, LogFile
+from sonar_graph.logs.mcap.writer import write_recording
+from sonar_graph.logs.reading import read_log
+from sonar_graph.logs.roles import TF
+from sonar_graph.logs.vehicle_setup import PartialCalibration, encode_mountings
+from sonar_graph.logs.writing import dvl_messages, imu_messages, static_message
+
+LIMIT = 1 << 16
+PACK: dict[str, Callable[[bytes], bytes]] = {"zstd": zstandard.compress, "lz4": lz4.frame.compress, "": bytes}
+
+
+def log_with_chunk(path: Path, content: bytes, compression: str, size: int) -> Path:
+    packed = PACK[compression](content)
+    letters = compression.encode()
+    head = struct.pack("<QQQII", 1, 2, size, 0, len(letters)) + letters + struct.pack("<Q", len(packed))
+    chunk = struct.pack("<BQ", 6, len(head) + len(packed)) + head + packed
+    path.write_bytes(MAGIC + struct.pack("<BQII", 1, 8, 0, 0) + chunk + struct.pack("<BQI", 15, 4, 0))
+    return path
+
+
+@pytest.mark.parametrize("compression", PACK)
+@pytest.mark.parametrize(("size", "stated"), [(LIMIT, LIMIT), (LIMIT + 1, LIMIT + 1), (LIMIT + 1, 9), (9, 2**62)])
+def test_a_chunk_of_more_than_the_limit_is_lost_with_limit_and_remedy_before_it_is_unpacked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compression: str, size: int, stated: int
+) -> None:
+    for module in (chunks, records):
+        monkeypatch.setattr(module, "LARGEST_BYTES", LIMIT)
+    path = log_with_chunk(tmp_path / "log.mcap", bytes(size), compression, stated)
+    (loss,) = reader.scan(path, lambda _: Keep.ALL).damage.losses
+    if (size, stated) == (LIMIT, LIMIT):
+        assert "unread" in loss.reason  # zeros are no records
+    elif size > LIMIT and (stated > LIMIT or compression == "zstd") and compression:
+        assert str(LIMIT) in loss.reason
+        assert "mcap compress" in loss.reason
+    else:
+        assert "is lost" in loss.reason
+
+
+def test_messages_far_larger_than_their_file_are_refused(tmp_path: Path, monkeypatch: Any, make_sequence: Any) -> None:
+    write_recording(tmp_path / "log.mcap", [imu_messages("/imu", make_sequence().imu)], {})
+    size = (tmp_path / "log.mcap").stat().st_size
+    monkeypatch.setattr(reader, "LARGEST_BYTES", 10)
+    reader.scan(tmp_path / "log.mcap", lambda _: Keep.ALL)
+    monkeypatch.setattr(reader, "_LARGEST_RATIO", 1 / size)
+    with pytest.raises(LogError, match=rf"its {size} bytes unpack to more than .* --start and --end"):
+        reader.scan(tmp_path / "log.mcap", lambda _: Keep.ALL)
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device"])
+def test_a_pipe_or_device_is_refused_wherever_a_file_is_read(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "in.mcap"
+    os.mkfifo(path) if kind == "pipe" else path.symlink_to("/dev/zero")
+    for read in (read_log, inspect_log):
+        with pytest.raises(LogError, match=r"in\.mcap cannot be read: it is a pipe, a socket or a device"):
+            read(path)
+    with pytest.raises(CalibrationError, match="it is a pipe"):
+        PartialCalibration.read(path)
+
+
+def test_a_text_that_is_too_large_is_refused_unread(tmp_path: Path) -> None:
+    path = tmp_path / "a.toml"
+    path.touch()
+    os.truncate(path, 1 << 40)  # without a block on the disk
+    with pytest.raises(OSError, match=f"it has {1 << 40} bytes, and at most"):
+        text_of(path)
+
+
+SLOW: dict[str, str] = {
+    "line feeds": "float64 a\n" + "=" * 80 + "\n" * 300_000 + "x",
+    "separators": ("=" * 80 + "\n") * 12_000,
+    "spaces": "float64 a" + " " * 900_000,
+    "fields": "\n".join(f"float64 f{i}" for i in range(60_000)),
+    "an array": f"float64[{'9' * 5000}] a",
+}
+
+
+@pytest.mark.parametrize("text", SLOW.values(), ids=SLOW)
+def test_definitions_are_parsed_in_a_time_that_grows_with_their_length(text: str) -> None:
+    began = time.process_time()
+    for kind in ("p/msg/A", "p/msg/B"):
+        for _ in range(5):
+            with contextlib.suppress(LogError):
+                parse_definition(kind, text)
+    assert time.process_time() - began < 2.0
+
+
+def test_sections_apart_by_blank_lines_and_spaces_are_the_same_definition() -> None:
+    plain = "q/B b\n" + "=" * 80 + "\nMSG: q/B\nint32 c\n"
+    spaced = plain.replace("\n", "  \r\n\n\t\n")
+    found = [parse_definition(f"p/msg/{name}", text).fields[0] for name, text in (("A", plain), ("C", spaced))]
+    assert [(one.name, one.kind.name, one.kind.fields[0].name) for one in found if not isinstance(one.kind, str)] == [
+        ("b", "q/B", "c")
+    ] * 2
+
+
+def test_many_ends_of_the_data_are_no_more_work_than_a_few(tmp_path: Path) -> None:
+    end = struct.pack("<BQI", 15, 4, 0)
+    footer = struct.pack("<BQQQI", 2, 20, 30, 0, zlib.crc32(b"other"))
+    (tmp_path / "log.mcap").write_bytes(MAGIC + struct.pack("<BQII", 1, 8, 0, 0) + end * 200_000 + footer + MAGIC)
+    began = time.process_time()
+    with LogFile(tmp_path / "log.mcap") as file:
+        summary, fault = read_summary(file)
+    assert (summary, str(fault)) == (None, "its summary is damaged: the CRC does not fit")
+    assert time.process_time() - began < 2.0
+
+
+ROTATION, TRANSLATION = "a quaternion of length ", "numbers that are not finite"
+
+
+@pytest.mark.parametrize(
+    ("of", "value", "message"),
+    [
+        ("rotation", np.nan, TRANSLATION),
+        ("rotation", np.inf, TRANSLATION),
+        ("rotation", 0.0, ROTATION + "0"),
+        ("rotation", 1e200, ROTATION),
+        ("translation", np.nan, TRANSLATION),
+        ("translation", 1e300, r"dvl: is .* m from base_link"),
+        ("translation", 2000.0, r"dvl: is .* m from base_link"),
+    ],
+)
+def test_a_mounting_that_cannot_be_is_named_unless_the_user_states_it(
+    make_sequence: Any, tmp_path: Path, of: str, value: float, message: str
+) -> None:
+    sequence, path = make_sequence(), tmp_path / "log.mcap"
+    payload = bytearray(encode_mountings(Calibration())[0].tobytes())
+    ends = [
+        at for at in range(4, len(payload) - 8, 4) if struct.unpack_from("<d", payload, at)[0] == 1.0 and at % 8 == 4
+    ]
+    w = ends[1]  # of the second transform, the Doppler log's: x, y, z, then the quaternion's x, y, z, w
+    for at in (w - 24, w - 16, w - 8, w) if of == "rotation" else (w - 48,):
+        struct.pack_into("<d", payload, at, value)
+    tree = static_message("/tf_static", TF, 0, np.frombuffer(bytes(payload), np.uint8)[None])
+    write_recording(path, [tree, imu_messages("/imu", sequence.imu), dvl_messages("/dvl", sequence.dvl)], {})
+    with pytest.raises(LogError, match=rf"log\.mcap: dvl: /tf_static: .*{message}.*--calibration"):
+        read_log(path)
+    assert any("--calibration" in text for text in inspect_log(path).damage)
+    stated = PartialCalibration.parse({"dvl": {"mounting": {}}}, "vehicle.toml")
+    assert read_log(path, calibration=stated).calibration.dvl.mounting.translation_m == (0.0, 0.0, 0.0)
