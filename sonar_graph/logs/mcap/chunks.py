@@ -93,10 +93,8 @@ def unpack(chunk: ChunkRecord, packed: bytes) -> bytes:
                 packed, max_output_size=_limited(chunk.uncompressed_size if unknown else size)
             )
         elif chunk.compression == "lz4" or (chunk.compression and packed.startswith(_LZ4)):
-            frame = lz4.frame.LZ4FrameDecompressor()
-            data = frame.decompress(packed, max_length=_limited(chunk.uncompressed_size) + 1)
-            if not frame.eof:
-                raise ChunkError(f"it has another size than the {chunk.uncompressed_size} bytes that it states")
+            size = _limited(chunk.uncompressed_size)
+            data = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size + 1)
         elif chunk.compression:
             raise ChunkError(f"its compression {chunk.compression!r} is not known")
     except (zstandard.ZstdError, RuntimeError, MemoryError, ValueError) as error:
