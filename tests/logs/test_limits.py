@@ -64,7 +64,7 @@ def test_messages_far_larger_than_their_file_are_refused(tmp_path: Path, monkeyp
     size = (tmp_path / "log.mcap").stat().st_size
     monkeypatch.setattr(reader, "LARGEST_BYTES", 10)
     reader.scan(tmp_path / "log.mcap", lambda _: Keep.ALL)
-    monkeypatch.setattr(reader, "_LARGEST_RATIO", 1 / size)
+    monkeypatch.setattr(reader, "LARGEST_RATIO", 1 / size)
     with pytest.raises(LogError, match=rf"its {size} bytes unpack to more than .* --start and --end"):
         reader.scan(tmp_path / "log.mcap", lambda _: Keep.ALL)
 

@@ -8,12 +8,16 @@ same to the nanosecond. The types and MD5 sums of a ROS 1 bag are kept in a meta
 from __future__ import annotations
 
 import bz2
+import os
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, BinaryIO
 
 import lz4.frame
 from mcap.writer import Writer
@@ -22,6 +26,7 @@ from sonar_graph.errors import LogError, SonarGraphError
 from sonar_graph.files import regular, written_whole
 from sonar_graph.logs.mcap import (
     LARGEST_BYTES,
+    LARGEST_RATIO,
     LIBRARY,
     ROSBAG2_METADATA,
     START_BYTES,
@@ -40,6 +45,8 @@ SOURCE_METADATA = "rosbag"
 """Metadata record of the type and MD5 sum of each topic in the bag."""
 _RENAMED = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
 _CHUNK_BYTES = _PIECE_BYTES = 1 << 20
+_METADATA = "metadata.yaml"
+_ZSTD = "compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd"  # that of rosbags
 _STEPS = 1000
 _INSTALL = "pip install 'sonar-graph[rosbag]'"
 Recode = Callable[[bytes], memoryview]
@@ -91,17 +98,26 @@ def _open_bag(source: Path) -> Iterator[AnyReader]:
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.rosbag1 import reader as rosbag1
+        from rosbags.rosbag2 import reader as rosbag2
+        from rosbags.rosbag2 import storage_mcap
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise LogError(f"{source}: bags are read by the rosbags library, which is not installed: {_INSTALL}") from error
     rosbag1.decompressors.update(bz2=limited_bz2, lz4=limited_lz4)  # its own have no limit
+    storage_mcap.DECOMPRESSORS.update(lz4=lambda one, _: limited_lz4(one), zstd=lambda one, _: limited_zstd(one))
+    vars(rosbag2).update(zstd=SimpleNamespace(open=limited_zstd_file, decompress=limited_zstd))
+    is_file_in_bag = source.suffix == ".db3" and (source.parent / _METADATA).exists()
+    path = source.parent if is_file_in_bag else source
+    try:
+        for part in [source, *(path.iterdir() if path.is_dir() else ())]:
+            regular(part)
+    except OSError as error:
+        raise LogError(f"{error.filename} cannot be read: {error.strerror}") from error
     if source.is_file():
-        with regular(source).open("rb") as stream:
+        with source.open("rb") as stream:
             fault = why_no_bag(source, stream.read(START_BYTES))
         if fault is not None:
             raise LogError(f"{source} is {fault}")
-    is_file_in_bag = source.suffix == ".db3" and (source.parent / "metadata.yaml").exists()
-    path = source.parent if is_file_in_bag else source
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as bag:
             yield bag
@@ -118,30 +134,59 @@ def _open_bag(source: Path) -> Iterator[AnyReader]:
 
 
 def limited_bz2(packed: bytes) -> bytes:
-    """Content of a bz2 chunk; a LogError where it has more than `LARGEST_BYTES`."""
+    """Content of a bz2 chunk; a LogError where it is cut off or has more than `LARGEST_BYTES`."""
     chunk = bz2.BZ2Decompressor()
-    return _whole(chunk.decompress(packed, LARGEST_BYTES + 1))
+    return _whole(chunk.decompress(packed, LARGEST_BYTES + 1), is_whole=chunk.eof)
+
+
+def limited_zstd(packed: bytes) -> bytes:
+    """Content of a zstd chunk or message; a LogError where it is cut off or has more than `LARGEST_BYTES`."""
+    chunk = import_module(_ZSTD).ZstdDecompressor()
+    return _whole(chunk.decompress(packed, LARGEST_BYTES + 1), is_whole=chunk.eof)
 
 
 def limited_lz4(packed: bytes) -> bytes:
-    """Content of an lz4 chunk; a LogError where it has more than `LARGEST_BYTES`."""
+    """Content of an lz4 chunk; a LogError where it is cut off or has more than `LARGEST_BYTES`."""
     chunk, content = lz4.frame.LZ4FrameDecompressor(), bytearray()
     while not chunk.eof and len(content) <= LARGEST_BYTES:
         part = chunk.decompress(packed, max_length=_PIECE_BYTES)
         if not part and chunk.needs_input:
-            raise LogError("a chunk is cut off")
+            break
         content += part
         packed = b""
-    return _whole(bytes(content))
+    return _whole(bytes(content), is_whole=chunk.eof)
 
 
-def _whole(content: bytes) -> bytes:
+def _whole(content: bytes, *, is_whole: bool) -> bytes:
     if len(content) > LARGEST_BYTES:
         raise LogError(
             f"a chunk of the bag has more than {LARGEST_BYTES} bytes, which is too much at once: `rosbag decompress` "
-            "and `rosbag filter` write smaller chunks"
+            "and `rosbag filter`, or `ros2 bag convert`, write smaller chunks"
         )
+    if not is_whole:
+        raise LogError("a chunk is cut off")
     return content
+
+
+@contextmanager
+def limited_zstd_file(packed: BinaryIO, mode: str) -> Iterator[SimpleNamespace]:
+    """Open a compressed file of a bag; a LogError where it unpacks to far more than a recording of its size does."""
+    size, unpacked = os.fstat(packed.fileno()).st_size, 0
+    most = max(LARGEST_BYTES, size * LARGEST_RATIO)
+    with import_module(_ZSTD).open(packed, mode) as stream:
+
+        def read(count: int) -> bytes:
+            nonlocal unpacked
+            piece: bytes = stream.read(count)
+            unpacked += len(piece)
+            if unpacked > most:
+                raise LogError(
+                    f"{packed.name}: its {size} bytes unpack to more than {most}, as no recording's do; where it is "
+                    "sound, unpack it with `zstd -d` into a folder of its own, and give the file there"
+                )
+            return piece
+
+        yield SimpleNamespace(read=read)
 
 
 class _BagCopy:

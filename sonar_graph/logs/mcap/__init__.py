@@ -3,7 +3,7 @@
 # fmt: off
 from sonar_graph.logs.mcap.file_summary import Instant, TimeWindow, parse
 from sonar_graph.logs.mcap.reader import ChunkPart, Passage, Progress, Recording, scan, stream
-from sonar_graph.logs.mcap.records import LARGEST_BYTES, START_BYTES, LogFile, seal, why_no_bag
+from sonar_graph.logs.mcap.records import LARGEST_BYTES, LARGEST_RATIO, START_BYTES, LogFile, seal, why_no_bag
 from sonar_graph.logs.mcap.topic import STAMP_BYTES, Keep, Topic
 from sonar_graph.logs.mcap.writer import (
     LIBRARY, ROSBAG2_METADATA, TRANSIENT_LOCAL, Attachment, Outgoing, RecordingWriter, is_own_log, recording,
@@ -11,8 +11,8 @@ from sonar_graph.logs.mcap.writer import (
 )
 
 __all__ = [
-    "Attachment", "ChunkPart", "Instant", "Keep", "LARGEST_BYTES", "LIBRARY", "LogFile", "Outgoing", "Passage",
-    "Progress", "ROSBAG2_METADATA", "Recording", "RecordingWriter", "STAMP_BYTES", "START_BYTES", "TRANSIENT_LOCAL",
-    "TimeWindow", "Topic", "is_own_log", "parse", "recording", "scan", "seal", "stream", "why_no_bag",
-    "write_recording",
+    "Attachment", "ChunkPart", "Instant", "Keep", "LARGEST_BYTES", "LARGEST_RATIO", "LIBRARY", "LogFile", "Outgoing",
+    "Passage", "Progress", "ROSBAG2_METADATA", "Recording", "RecordingWriter", "STAMP_BYTES", "START_BYTES",
+    "TRANSIENT_LOCAL", "TimeWindow", "Topic", "is_own_log", "parse", "recording", "scan", "seal", "stream",
+    "why_no_bag", "write_recording",
 ]

@@ -29,6 +29,7 @@ from sonar_graph.logs.mcap.chunks import (
 from sonar_graph.logs.mcap.file_summary import TimeWindow, first_time_ns, parse, read_summary
 from sonar_graph.logs.mcap.records import (
     LARGEST_BYTES,
+    LARGEST_RATIO,
     PRIVATE,
     ByteRange,
     ChunkRecord,
@@ -43,8 +44,6 @@ from sonar_graph.logs.mcap.topic import Damage, Descriptions, Keep, Loss, Topic,
 _BLOCK = 1 << 22
 _NS_PER_S = 1_000_000_000
 _PIECE_BYTES = 1 << 20
-_LARGEST_RATIO = 64
-"""Bytes of messages for each byte of a log; samples of an IMU at rest, each with its stamp, compress by some thirty."""
 Progress = Callable[[int, int], None]
 """Function called with the bytes done and the bytes in all."""
 
@@ -427,7 +426,7 @@ def scan(
 
 def _gather_all(passage: Passage, file: LogFile) -> None:
     """Gather the wanted messages by topic; a LogError where they are more than a log of this size can honestly hold."""
-    held, most = 0, max(LARGEST_BYTES, file.size * _LARGEST_RATIO)
+    held, most = 0, max(LARGEST_BYTES, file.size * LARGEST_RATIO)
     for piece in passage:
         before = piece.topic.held_bytes
         piece.topic.gather(piece.data, *piece.found)

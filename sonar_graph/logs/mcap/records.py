@@ -61,6 +61,8 @@ def _unknown_kind(start: bytes, advice: str) -> str:
 HEAD = struct.Struct("<BQ")
 LARGEST_BYTES = 1 << 28
 """Most bytes of one record, and of a chunk without compression; a stated size could ask for all memory."""
+LARGEST_RATIO = 64
+"""Bytes of messages for each byte of a log; samples of an IMU at rest, each with its stamp, compress by some thirty."""
 SMALLER_CHUNKS = "`mcap compress LOG -o OUT.mcap --chunk-size 4194304` writes smaller chunks"
 LOOSE = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
 """Kinds of records within chunks; outside where the writer makes no chunks."""

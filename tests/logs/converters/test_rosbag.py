@@ -1,19 +1,25 @@
+import bz2
+import os
 import sys
 from pathlib import Path
 from typing import Any
 
+import lz4.frame
 import numpy as np
 import pytest
+import zstandard
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer as Ros1Writer
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import CompressionFormat, StoragePlugin
+from rosbags.rosbag2 import CompressionMode as Compression
 from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from sonar_graph.errors import LogError
 from sonar_graph.logs.adapters.log_config import LogConfig
-from sonar_graph.logs.convert.rosbag import convert_rosbag
+from sonar_graph.logs.convert import rosbag
+from sonar_graph.logs.convert.rosbag import convert_rosbag, limited_bz2, limited_lz4, limited_zstd
 from sonar_graph.logs.reading import read_log
 
 T0_NS = 1_447_550_804_242_631_687
@@ -109,6 +115,63 @@ def test_sqlite3_bags_keep_their_payloads(tmp_path, decoded):
         found = decoded(tmp_path / "new.mcap")
         assert [m.angular_velocity.x for m in found["/imu"]] == [0, 1, 2, 3, 4]
         assert found["/tf_static"][0].transforms[0].transform.translation.y == 2
+
+
+PACKED = [
+    *((Compression.FILE, plugin) for plugin in StoragePlugin),
+    *((Compression.MESSAGE, plugin) for plugin in StoragePlugin),
+    (Compression.STORAGE, StoragePlugin.MCAP),
+]
+
+
+@pytest.mark.parametrize(("mode", "plugin"), PACKED, ids=str)
+@pytest.mark.parametrize(("size", "is_read"), [(1000, True), (1 << 20, False)])
+def test_what_unpacks_to_more_than_the_limit_is_refused_with_limit_and_remedy(
+    tmp_path, monkeypatch, mode, plugin, size, is_read
+):
+    limit = 1 << 18
+    monkeypatch.setattr(rosbag, "LARGEST_BYTES", limit)
+    store, folder = get_typestore(Stores.ROS2_JAZZY), tmp_path / "bag"
+    writer = Ros2Writer(folder, version=9, storage_plugin=plugin)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    write_bag(writer, store, [("/a", "std_msgs/msg/String", store.types["std_msgs/msg/String"]("a" * size))])
+    if is_read:
+        assert convert_rosbag(folder, tmp_path / "new.mcap").messages == 1
+        return
+    remedy = "unpack it with `zstd -d`" if mode == Compression.FILE else "`ros2 bag convert`"
+    with pytest.raises(LogError, match=rf"{limit}.*{remedy}"):
+        convert_rosbag(folder, tmp_path / "new.mcap")
+    assert [path.name for path in tmp_path.iterdir()] == ["bag"]
+
+
+def test_an_unpacked_file_alone_is_read(tmp_path, decoded):
+    """As the advice about files that are too large says."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    writer = Ros2Writer(tmp_path / "ros2", version=9, storage_plugin=StoragePlugin.SQLITE3)
+    write_bag(writer, store, messages(store, ros1=False))
+    (database,) = (tmp_path / "ros2").glob("*.db3")
+    database = database.rename(tmp_path / "alone.db3")
+    assert convert_rosbag(database, tmp_path / "new.mcap").messages == 6
+
+
+@pytest.mark.parametrize("unpack", [limited_bz2, limited_lz4, limited_zstd])
+def test_a_chunk_that_is_cut_off_is_no_chunk(unpack):
+    pack = {limited_bz2: bz2.compress, limited_lz4: lz4.frame.compress, limited_zstd: zstandard.compress}[unpack]
+    content = np.random.default_rng(0).bytes(300_000)
+    packed = pack(content)
+    assert unpack(packed) == content
+    with pytest.raises(LogError, match="a chunk is cut off"):
+        unpack(packed[:-200])
+
+
+@pytest.mark.parametrize("name", ["", "metadata.yaml", "a_0.db3"])
+def test_a_pipe_in_the_place_of_a_bag_or_in_it_is_refused(tmp_path, name):
+    path = tmp_path / "bag" / name
+    path.parent.mkdir(exist_ok=True)
+    os.mkfifo(path if name else path.with_name("bag.bag"))
+    source = tmp_path / "bag" if name else path.with_name("bag.bag")
+    with pytest.raises(LogError, match=f"{name} cannot be read: it is a pipe"):
+        convert_rosbag(source, tmp_path / "new.mcap")
 
 
 def test_a_type_of_the_users_own_keeps_its_definition_and_what_is_not_of_it_is_told(tmp_path, decoded):
