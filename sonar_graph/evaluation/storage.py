@@ -31,7 +31,7 @@ from sonar_graph.calibration import Calibration
 from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation.metrics import rmse
 from sonar_graph.evaluation.results import Comparison, Ensemble, ErrorSeries, Kind, MapSoFar, RunResult, Score, gathered
-from sonar_graph.files import COMPARISON, read_json, replacing, result_written, write_json
+from sonar_graph.files import COMPARISON, read_json, regular, replacing, result_written, write_json
 from sonar_graph.logs import Picture, write_landmarks_csv, write_result, write_tum
 from sonar_graph.logs.mcap import Attachment
 from sonar_graph.measurements import Dvl, Imu, LandmarkDetections
@@ -256,7 +256,7 @@ def _read_arrays(path: Path) -> Arrays:
     Raises `EvaluationError` when the file is missing or damaged.
     """
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+        with regular(path).open("rb") as file, np.load(file, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise EvaluationError(f"{path}: cannot be read as arrays ({error}); write the comparison anew") from error

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sonar_graph.files import COMPARISON, read_json, replacing, result_written, write_json
+from sonar_graph.files import COMPARISON, read_json, regular, replacing, result_written, write_json
 from sonar_graph.measurements import LandmarkDetections
 from sonar_graph.sonar import Fan
 from sonar_graph.states import LandmarkMap
@@ -117,7 +117,9 @@ def read_recognition(folder: Path) -> Recognition | None:
         return None
     entry: dict[str, Any] = read_json(folder / RECOGNITION)
     pictures = [
-        DrawnFrame(stamp, (folder / PICTURE_FOLDER / f"{stamp}.jpg").read_bytes(), tuple(ids), tuple(probabilities))
+        DrawnFrame(
+            stamp, regular(folder / PICTURE_FOLDER / f"{stamp}.jpg").read_bytes(), tuple(ids), tuple(probabilities)
+        )
         for stamp, ids, probabilities in entry["pictures"]
     ]
     warnings = [(stamp, reason) for stamp, reason in entry["warnings"]]
