@@ -16,9 +16,11 @@ from pathlib import Path
 from sonar_graph.batch.plan import plan_runs
 from sonar_graph.batch.recorded import RESULTS, RecordedBatch, read_batch
 from sonar_graph.batch.result_table import write_results
+from sonar_graph.batch.sources import LOG, read_source
 from sonar_graph.batch.store import SUITE, Limits, PlannedRun, Progress, Row, RunOutcome, Store, Where
 from sonar_graph.batch.suite import SuiteFile, read_suite
-from sonar_graph.errors import BatchError
+from sonar_graph.errors import BatchError, SonarGraphError
+from sonar_graph.evaluation import expense
 from sonar_graph.files import (
     BATCH,
     deferred_interrupt,
@@ -26,6 +28,7 @@ from sonar_graph.files import (
     result_folder,
     result_written,
     terminations_as_interrupts,
+    text_of,
 )
 
 NEEDED_PACKAGES = ("distributed", "pyarrow")
@@ -42,6 +45,7 @@ def run_suite(
     retry_failed: bool = False,
     overwrite: bool = False,
     progress: Callable[[int, int, int], None] | None = None,
+    notice: Callable[[str], None] | None = None,
 ) -> RecordedBatch:
     """Run a suite: logs or simulations, seeds, estimators and variants. Runs that are done already are kept.
 
@@ -66,6 +70,8 @@ def run_suite(
         Replace suite and table in the folder also where they are another suite's, or not this package's.
     progress
         Called at the start and after each run with the number of runs that are done, planned and failed.
+    notice
+        Called before the first run with a sentence on each log that takes long. Logs are read for that.
 
     Returns
     -------
@@ -126,9 +132,13 @@ def run_suite(
             report()
 
         report()
+        limits = limits_of(file, timeout_s)
         try:
             with terminations_as_interrupts():
-                batch.run(Where(workers, scheduler), limits_of(file, timeout_s), count)
+                if notice is not None:
+                    for sentence in batch.large_logs():
+                        notice(f"{sentence}; a run is ended after {limits.timeout_s:g} s")
+                batch.run(Where(workers, scheduler), limits, count)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(batch.resuming()) from None
     return read_batch(folder)
@@ -157,7 +167,7 @@ class Batch:
         store = Store(folder)
         with result_folder(folder, BATCH, overwrite=overwrite, refusal=BatchError) as written:
             with contextlib.suppress(OSError, ValueError):  # no suite here, or none that can be resumed
-                name = tomllib.loads((folder / SUITE).read_text(encoding="utf-8")).get("name")
+                name = tomllib.loads(text_of(folder / SUITE)).get("name")
                 if name != file.suite.name and not overwrite:  # one that was edited but has its name goes on here
                     raise BatchError(
                         f"{folder}: holds the batch of suite {name!r}, and {file.path} is suite {file.suite.name!r}; "
@@ -171,6 +181,18 @@ class Batch:
     def rows(self) -> dict[str, Row]:
         """Rows of the runs that are done, by key."""
         return {run.key: row for run in self.runs if (row := self.store.row(run.key)) is not None}
+
+    def large_logs(self) -> Iterator[str]:
+        """Sentences with what the runs of large logs take, for runs that are not done.
+
+        Data sets and simulations are not read: their size is known to whoever names them.
+        """
+        done = self.rows()
+        missing = {run.log: run for run in self.runs if run.kind == LOG and run.key not in done}
+        for run in missing.values():
+            with contextlib.suppress(SonarGraphError):  # the run fails with the reason
+                if said := expense(read_source(run.kind, run.options, run.seed, run.landmarks)):
+                    yield f"A large log, {run.log}, {said}"
 
     def discard_failed(self) -> None:
         """Remove runs that did not succeed, so that they are done again."""

@@ -36,7 +36,6 @@ from sonar_graph.evaluation import (
 )
 from sonar_graph.files import LOCK, MANIFEST, READY, Tell, serve
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation import LandmarkOptions, add_landmarks
 
 KEPT_SEQUENCES = 3
 """Sequences kept in memory, since estimators of one log mostly follow each other; one is that of the warm-up."""
@@ -128,10 +127,9 @@ def _sequence(kind: str, options: str, content: str, seed: int | None, landmarks
     """
     values = json.loads(options)
     _check_content(kind, values, content)
-    sequence = read_source(kind, values, seed)
+    sequence = read_source(kind, values, seed, json.loads(landmarks))
     _check_content(kind, values, content)
-    placed = json.loads(landmarks)
-    return sequence if placed is None else add_landmarks(sequence, LandmarkOptions(**(placed | {"seed": seed})))
+    return sequence
 
 
 def _check_content(kind: str, options: dict[str, Any], content: str) -> None:

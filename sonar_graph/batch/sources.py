@@ -22,7 +22,15 @@ from sonar_graph.logs.adapters import LogConfig, read_log_config
 from sonar_graph.logs.convert import read_akit, read_mrclam, read_victoria_park
 from sonar_graph.logs.mcap import LogFile, TimeWindow
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation import BasinOptions, MissionOptions, cruise_speed, simulate_basin, simulate_mission
+from sonar_graph.simulation import (
+    BasinOptions,
+    LandmarkOptions,
+    MissionOptions,
+    add_landmarks,
+    cruise_speed,
+    simulate_basin,
+    simulate_mission,
+)
 
 Stamp = tuple[int, int, int, int]
 _BLOCK_BYTES = 1 << 20
@@ -113,14 +121,17 @@ FILE = "file"
 """Key in fingerprints for the file of a data set that has no option for one."""
 
 
-def read_source(kind: str, options: dict[str, Any], seed: int | None) -> Sequence:
-    """Read or simulate the sequence of a source; a generator takes the seed.
+def read_source(
+    kind: str, options: dict[str, Any], seed: int | None, landmarks: dict[str, Any] | None = None
+) -> Sequence:
+    """Read or simulate the sequence of a source, with simulated landmarks where there are options for them.
 
-    Raises `SonarGraphError` from the reader or simulator.
+    A generator takes the seed, and so do landmarks. Raises `SonarGraphError` from the reader or simulator.
     """
     source = KINDS[kind]
     values = options | {"seed": seed} if kind in GENERATORS else options
-    return source.read(source.options.model_validate(values))
+    sequence = source.read(source.options.model_validate(values))
+    return sequence if landmarks is None else add_landmarks(sequence, LandmarkOptions(**(landmarks | {"seed": seed})))
 
 
 def fingerprint(kind: str, options: dict[str, Any]) -> dict[str, Any]:

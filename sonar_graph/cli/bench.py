@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections import Counter
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -84,6 +85,7 @@ def bench(
                 retry_failed=retry_failed,
                 overwrite=overwrite,
                 progress=progress,
+                notice=partial(echo, err=True),
             )
     except KeyboardInterrupt as error:
         echo(f"sonar-graph: interrupted; {error}".rstrip("; "), err=True)

@@ -44,13 +44,14 @@ def inspect(
         echo(summary.toml, nl=False)
         return
     findings: list[Finding] = []
-    skipped = ""
+    skipped = large = ""
     if quick:
         skipped = "not compared: --quick"
     elif summary.obstacles:
         skipped = f"not compared: {', '.join(summary.obstacles)}"
     else:
         from sonar_graph.diagnosis import check_sensors
+        from sonar_graph.evaluation import expense
         from sonar_graph.logs import read_log
 
         try:
@@ -58,18 +59,19 @@ def inspect(
                 sequence = read_log(
                     log, calibration=given, config=config, topics=reading.choices, window=reading.window
                 )
+                large = expense(sequence)
                 findings = check_sensors(sequence, config)
         except SonarGraphError as error:
             skipped = f"not compared: {error}"
     if as_json:
         content = asdict(summary) | {"path": str(summary.path), "duration_s": summary.duration_s}
         content |= {"obstacles": summary.obstacles, "sensors": [finding.plain() for finding in findings]}
-        echo(strict_json(content | {"sensors_skipped": skipped}))
+        echo(strict_json(content | {"sensors_skipped": skipped, "large": large}))
     else:
-        print_summary(summary, findings, skipped)
+        print_summary(summary, findings, skipped, large)
 
 
-def print_summary(summary: LogSummary, findings: list[Finding], skipped: str) -> None:
+def print_summary(summary: LogSummary, findings: list[Finding], skipped: str, large: str = "") -> None:
     """Print the tables of a log, and a line for each note, finding and warning."""
     console = answers()
 
@@ -105,6 +107,8 @@ def print_summary(summary: LogSummary, findings: list[Finding], skipped: str) ->
         for finding in findings:
             say(finding.quantity, finding.text(), "bold yellow" if finding.acts else "bold")
         console.print()
+    if large:
+        say("large", large, "bold yellow")
     for rows in summary.left_out:
         say("left out", rows)
     for topic in summary.topics:

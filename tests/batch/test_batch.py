@@ -16,14 +16,17 @@ import pytest
 
 from sonar_graph.batch import batch as batch_module
 from sonar_graph.batch import cluster
-from sonar_graph.batch.batch import Batch, limits_of
+from sonar_graph.batch.batch import Batch, limits_of, run_suite
 from sonar_graph.batch.one_run import perform
 from sonar_graph.batch.recorded import is_batch, read_batch
 from sonar_graph.batch.result_table import RESULTS, is_timing
 from sonar_graph.batch.store import Limits, PlannedRun, Progress, RunOutcome, Store, Where
 from sonar_graph.batch.suite import read_suite
 from sonar_graph.errors import BatchError, EvaluationError
+from sonar_graph.evaluation import comparison
 from sonar_graph.files import deferred_interrupt, noticed_interrupts, terminations_as_interrupts
+from sonar_graph.logs import write_log
+from sonar_graph.testing import small_world
 
 from .conftest import BASIN, DEAD_RECKONING, HEADER
 
@@ -66,6 +69,27 @@ def statuses_after(batch: Batch) -> Counter[str]:
     """Number of runs by status, after all of them were done."""
     batch.run(HERE, LIMITS, nobody)
     return Counter(str(row["status"]) for row in batch.rows().values())
+
+
+def test_what_a_large_log_takes_is_said_before_its_first_run(write_suite, in_this_process, monkeypatch, tmp_path):
+    write_log(tmp_path / "a.mcap", small_world())
+    suite = write_suite(HEADER, '[[logs]]\nname = "a"\nlog = "a.mcap"\n', DEAD_RECKONING)
+    said: list[str] = []
+
+    def do_and_say(runs: list[PlannedRun], *given: Any) -> None:
+        said.extend("run" for _ in runs)
+        do_here(runs, *given)
+
+    monkeypatch.setattr(cluster, "run_batch", do_and_say)
+    run_suite(suite, tmp_path / "small", timeout_s=60.0, notice=said.append)
+    monkeypatch.setattr(comparison, "LONG_S", 0.0)
+    for _ in range(2):  # a batch that is done takes nothing
+        run_suite(suite, tmp_path / "large", timeout_s=60.0, notice=said.append)
+    rows = len(small_world().imu)
+    assert said[0] == said[2] == "run"
+    assert said[1].startswith(f"A large log, a, for each estimator: {rows} IMU rows")
+    assert said[1].endswith("; a run is ended after 60 s")
+    assert len(said) == 3
 
 
 def finished(suite: Path, folder: Path) -> list[dict[str, Any]]:

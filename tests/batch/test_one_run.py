@@ -10,7 +10,7 @@ import pytest
 from sonar_graph.batch import one_run
 from sonar_graph.batch.one_run import perform
 from sonar_graph.batch.result_table import COLUMNS, is_timing
-from sonar_graph.batch.sources import fingerprint
+from sonar_graph.batch.sources import KINDS, LogOptions, SourceKind, fingerprint
 from sonar_graph.batch.store import PlannedRun
 from sonar_graph.batch.suite import METRICS
 from sonar_graph.errors import BatchError
@@ -88,7 +88,7 @@ def test_a_log_is_that_of_the_plan_or_gives_no_result(planned, tmp_path, monkeyp
     assert long["scored_instants"] > short["scored_instants"] > 0
     with pytest.raises(BatchError, match=r"log \S+dive\.mcap: not what it was when the run was planned"):
         perform(replace(planned_short, seed=1), tmp_path / "run")  # not in hand
-    run, read = replace(of_log(planned(), log), landmarks={}), one_run.read_source
+    run, read = replace(of_log(planned(), log), landmarks={}, seed=0), one_run.read_source
 
     def read_and_changed(*given: Any) -> Sequence:
         sequence = read(*given)
@@ -103,11 +103,10 @@ def test_a_log_is_that_of_the_plan_or_gives_no_result(planned, tmp_path, monkeyp
 def log_with_duration(folder: Path, monkeypatch: pytest.MonkeyPatch, duration_s: int) -> Path:
     """A file with a number in it, which is read as a simulated basin that lasts so long."""
 
-    def read(kind: str, options: dict[str, Any], _seed: int | None) -> Sequence:
-        assert kind == "mcap"
-        return simulate_basin(BasinOptions(duration_s=int(Path(options["log"]).read_text()), laps=1))
+    def read(options: LogOptions) -> Sequence:
+        return simulate_basin(BasinOptions(duration_s=int(Path(options.log).read_text()), laps=1))
 
-    monkeypatch.setattr(one_run, "read_source", read)
+    monkeypatch.setitem(KINDS, "mcap", SourceKind(LogOptions, read))
     log = folder / "dive.mcap"
     log.write_text(str(duration_s))
     return log

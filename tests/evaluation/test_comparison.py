@@ -7,11 +7,11 @@ import pytest
 from scipy.stats import chi2
 
 from sonar_graph.errors import EstimatorError, EvaluationError, UnknownEstimatorError
-from sonar_graph.evaluation.comparison import compare
+from sonar_graph.evaluation.comparison import compare, expense
 from sonar_graph.evaluation.results import RunResult
 from sonar_graph.evaluation.run import run_estimator
 from sonar_graph.evaluation.scores import detection_scores, landmark_scores, resource_scores
-from sonar_graph.measurements import Measurements
+from sonar_graph.measurements import Imu, LandmarkDetections, Measurements
 from sonar_graph.report import sentences
 from sonar_graph.report.landmark_table import landmark_table
 from sonar_graph.report.maps import true_landmarks_drawn
@@ -28,6 +28,26 @@ OTHER_KEYS = {
     *("detections.used", "detections.refused", "detections.unnamed", "detections.nis"),
     *("time.update_median_ms", "time.update_p99_ms", "time.update_max_ms", "time.total_s", "time.real_time_factor"),
 }
+
+
+def test_only_large_logs_are_said_to_take_long():
+    small = straight_sequence()
+    count = 10_000
+    many = LandmarkDetections(
+        stamps_ns=np.full(count, small.start_ns),
+        range_m=np.ones(count),
+        azimuth_rad=np.zeros(count),
+        range_azimuth_cov=np.tile(np.eye(2), (count, 1, 1)),
+        candidate_ids=np.column_stack([np.arange(count) % 1000, np.full(count, -1)]),
+        id_probability=np.tile([1.0, 0.0], (count, 1)),
+    )
+    assert expense(small) == ""
+    assert expense(replace(small, detections=many)) == (  # 8 (3 · 1000 + 15)² bytes, gone over 20,000 times
+        "for each estimator: 1000 landmark identities in 10000 detections, at least 0.1 GB and 2 min where an "
+        "estimator keeps their joint covariance"
+    )
+    rows = Imu(np.arange(2_000_000), *(np.zeros((2_000_000, 3)),) * 2)
+    assert expense(replace(small, imu=rows)) == "for each estimator: 2000000 IMU rows, about 1 min"
 
 
 def test_scores_of_a_constant_offset_by_hand_each_with_unit_and_protocol(install):
