@@ -23,9 +23,10 @@ import zipfile
 from collections.abc import Iterable
 from dataclasses import MISSING, asdict, fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import EvaluationError
@@ -48,6 +49,8 @@ INDEX, SEQUENCE, RUNS = "comparison.json", "sequence.npz", "runs"
 RESULT, SERIES, RESULT_LOG = "result.json", "series.npz", "result.mcap"
 ENSEMBLES = "ensembles.json"
 ESTIMATES = ("trajectory.tum", "causal.tum", "landmarks.csv")
+_SCORE, _TEXTS, _STATUS = TypeAdapter(Score), TypeAdapter(dict[str, str]), TypeAdapter(Literal["ok", "failed"])
+"""Types of what people may have edited in ``comparison.json``."""
 
 
 def result_names(estimators: Iterable[str]) -> list[str]:
@@ -215,7 +218,7 @@ def _restore(index: dict[str, Any], folder: Path) -> Comparison:
         arrays = _read_arrays(folder / RUNS / name / SERIES)
         runs.append(_restore_run(name, entry, arrays))
         scores[name] = {
-            key: Score(**(score | {"interval": tuple(score["interval"]) if score["interval"] else None}))
+            key: _SCORE.validate_python(score | ({"value": np.nan} if score["value"] is None else {}))
             for key, score in entry["scores"].items()
         }
         if "errors" in entry:
@@ -225,12 +228,12 @@ def _restore(index: dict[str, Any], folder: Path) -> Comparison:
     several = read_json(folder / ENSEMBLES) if (folder / ENSEMBLES).is_file() else {"ensembles": []}
     calibration = parse(Calibration, entry["calibration"], str(folder / INDEX))
     return Comparison(
-        sequence=_restore_sequence(entry["name"], calibration, entry["notes"], arrays),
+        sequence=_restore_sequence(entry["name"], calibration, _TEXTS.validate_python(entry["notes"]), arrays),
         instants_ns=arrays["instants_ns"],
         runs=runs,
         scores=scores,
         errors=errors,
-        environment=index["environment"],
+        environment=_TEXTS.validate_python(index["environment"]),
         recognition=read_recognition(folder),
         ensembles=[Ensemble(**one) for one in several["ensembles"]],
     )
@@ -302,8 +305,8 @@ def _restore_run(name: str, entry: dict[str, Any], arrays: Arrays) -> RunResult:
     return RunResult(
         name,
         entry["params"],
-        entry["status"],
-        entry["reason"],
+        _STATUS.validate_python(entry["status"]),
+        str(entry["reason"]),
         causal=_unpack("causal", Trajectory, arrays),
         smoothed=_unpack("smoothed", Trajectory, arrays),
         landmarks=_unpack("landmarks", LandmarkMap, arrays),

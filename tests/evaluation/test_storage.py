@@ -1,4 +1,5 @@
 import json
+import os
 import zipfile
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
@@ -179,6 +180,36 @@ def test_damage_is_named(folder, file, content, named):
             kept = {name: archive[name] for name in archive.files if name != content}
         np.savez(path, **kept)
     with pytest.raises(EvaluationError, match=named):
+        read_comparison(folder)
+
+
+@pytest.mark.parametrize(
+    ("way", "value"),
+    [
+        ("sequence notes log.note", 3),
+        ("environment numpy", None),
+        ("runs offset status", "well"),
+        ("runs offset scores causal.ate_raw_m value", "x"),
+        ("runs offset scores causal.ate_raw_m better", "x"),
+        ("runs offset scores causal.nees_position interval", [1]),
+    ],
+)
+def test_a_value_of_another_type_is_refused_before_a_page_is_drawn(folder, way, value):
+    content = json.loads((folder / "comparison.json").read_text())
+    *tables, name = way.split()
+    table = content
+    for key in tables:
+        table = table[key]
+    table[name] = value
+    (folder / "comparison.json").write_text(json.dumps(content))
+    with pytest.raises(EvaluationError, match="not as written; compare anew"):
+        read_comparison(folder)
+
+
+def test_a_pipe_in_the_place_of_results_is_refused(folder):
+    (folder / "sequence.npz").unlink()
+    os.mkfifo(folder / "sequence.npz")
+    with pytest.raises(EvaluationError, match="it is a pipe"):
         read_comparison(folder)
 
 
