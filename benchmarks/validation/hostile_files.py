@@ -3,6 +3,7 @@
 import bz2
 import json
 import os
+import shutil
 import struct
 import tempfile
 import zlib
@@ -22,6 +23,8 @@ from sonar_graph.logs import write_log
 from sonar_graph.testing import small_world
 
 MAGIC = b"\x89MCAP0\r\n"
+COMPARED = "compared"
+"""Folder beside the sound log in which it is compared."""
 NOISE = (  # what terminals, pages, spreadsheets and file systems might obey
     *("\x1b[2J\x1b]0;owned\x07", "\x9b31m", "\x00", "a\rb", "\u202e/imu", "=cmd|' /C calc'!A0", "+1+1", "@SUM(A1)"),
     *("<script>alert(1)</script>", "../../etc/passwd", "/" * 300, "x" * 100_000, "[red]a[/red]", "%s%n{0}", "\n\n", ""),
@@ -114,7 +117,9 @@ class SoundLog:
                     others.setdefault(names[found.channel_id], (found.channel_id, found.data))
                     if names[found.channel_id] != "/tf_static":
                         messages += message(found.channel_id, found.log_time, found.data)
-        return cls(path, described, messages, others)
+        log = cls(path, described, messages, others)
+        (folder / "control.mcap").write_bytes(log.content())
+        return log
 
     def content(self, *extra: bytes, compression: str = "zstd") -> bytes:
         """A sound chunk, and what is put after it."""
@@ -378,6 +383,10 @@ def recordings_of_sonars(_log: SoundLog, folder: Path, rng: Rng) -> Case:
         ("aris", b"DDF\x05"),
         ("oculus", b"\x53\x4f"),
     ][int(rng.integers(6))]
+    if rng.random() < 0.2:
+        return Case(
+            "recordings", ["convert", "rosbag", str(zstd_bag(folder / "in", rng)), "-o", str(folder / "out.mcap")]
+        )
     path = folder / f"in.{'db3' if start.startswith(b'SQL') else 'bag' if kind == 'rosbag' else 'bin'}"
     rest = rng.integers(0, 256, zeros(rng, 1 << 22) // 8, np.uint8).tobytes()
     if start.startswith(b"#ROSBAG") and rng.random() < 0.7:
@@ -400,6 +409,22 @@ def bag_chunk(rng: Rng) -> bytes:
             to = writer.add_connection("/a", "std_msgs/msg/String", typestore=get_typestore(Stores.ROS1_NOETIC))
             writer.write(to, 10**9, struct.pack("<I", size := zeros(rng, 1 << 29)) + bytes(size))
         return path.read_bytes()[len(b"#ROSBAG V2.0\n") :]
+
+
+def zstd_bag(path: Path, rng: Rng) -> Path:
+    """A ROS 2 bag with a message of many zeros, compressed in each way that there is."""
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    modes = (CompressionMode.FILE, CompressionMode.MESSAGE, CompressionMode.STORAGE)
+    mode = modes[int(rng.integers(len(modes)))]
+    is_mcap = mode == CompressionMode.STORAGE or rng.random() < 0.5
+    writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP if is_mcap else StoragePlugin.SQLITE3)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        to = writer.add_connection("/a", "std_msgs/msg/String", typestore=get_typestore(Stores.ROS2_JAZZY))
+        writer.write(to, 10**9, b"\0\1\0\0" + struct.pack("<I", size := zeros(rng, 1 << 29)) + bytes(size))
+    return path
 
 
 OURS = (
@@ -481,18 +506,43 @@ def manifest(rng: Rng, precious: Path) -> bytes:
     return json.dumps(content, default=str).encode()
 
 
+def results(log: SoundLog, folder: Path, rng: Rng) -> Case:
+    """Files of a comparison that somebody changed since."""
+    out = folder / "out"
+    shutil.copytree(log.path.parent / COMPARED, out)
+    changed = rng.choice(sorted(path for path in out.rglob("*") if path.is_file()), int(rng.integers(1, 4)))
+    for path in (Path(one) for one in changed):
+        content, which = bytearray(path.read_bytes()), rng.integers(6)
+        for at in rng.integers(0, max(len(content), 1), int(rng.integers(1, 6))) if content else ():
+            content[at] ^= 1 << int(rng.integers(8))
+        path.unlink()
+        if which == 0:
+            os.mkfifo(path)
+        elif which == 1:
+            path.symlink_to("/dev/zero")
+        elif which == 2:
+            path.write_bytes(content)
+            os.truncate(path, 1 << int(rng.integers(0, 29)))
+        elif which == 3:
+            path.write_text(DOCUMENTS[int(rng.integers(len(DOCUMENTS)))](rng), "utf-8", "surrogatepass")
+        else:
+            path.write_bytes(content)
+    again = ["compare", str(log.path), "-o", str(out), "--estimators", "dead-reckoning"]
+    return Case("results", ["report", str(out)] if rng.random() < 0.7 else again, [Path(one) for one in changed])
+
+
 FOLDER_CASES: dict[str, Callable[[SoundLog, Path, Rng], Case]] = {
     "pipes": reading_of_pipes,
     "texts": texts,
     "recordings": recordings_of_sonars,
     "folders": folders,
+    "results": results,
 }
 
 
-def cases(folder: Path, count: int, seed: int) -> Iterator[tuple[Path, Case]]:
+def cases(log: SoundLog, count: int, seed: int) -> Iterator[tuple[Path, Case]]:
     """Cases of every kind in turn, each made when it is asked for."""
-    log, kinds = SoundLog.written(folder), [*LOGS, *FOLDER_CASES]
-    (folder / "control.mcap").write_bytes(log.content())
+    folder, kinds = log.path.parent, [*LOGS, *FOLDER_CASES]
     for number in range(count):
         own = folder / f"{number:04d}"
         own.mkdir()

@@ -38,7 +38,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ[variable] = "1"  # processes are forked
 from common import make_parser, note, print_figures, print_table
-from hostile_files import NOISE, Case, cases
+from hostile_files import COMPARED, NOISE, Case, SoundLog, cases
 
 from sonar_graph.cli import main as sonar_graph
 from sonar_graph.logs import read_log, write_log
@@ -47,6 +47,8 @@ from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import BasinOptions, simulate_basin
 
 TIME_LIMIT_S, INTERRUPT_S = 10.0, 30.0
+LONGEST_PAUSE_S = 0.5
+"""Longer ones between two looks at a command are those of a machine that stood still."""
 MOST_RSS_MB = 1500.0
 TARGETS = {"tracebacks": 0, "hangs": 0, "silent_errors": 0, "files_lost": 0, "interrupts_missed": 0}
 
@@ -99,7 +101,6 @@ def run_apart(case: Case, folder: Path) -> Outcome:
     """The command in a forked process, and the reading of its log after it."""
     out, err, read = (folder.with_suffix(suffix) for suffix in (".out", ".err", ".read"))
     sys.stdout.flush()
-    began = time.monotonic()
     pid = os.fork()
     if pid == 0:
         os.setsid()
@@ -117,9 +118,11 @@ def run_apart(case: Case, folder: Path) -> Outcome:
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
+    seconds, before = 0.0, time.monotonic()
     while True:
         done, status, usage = os.wait4(pid, os.WNOHANG)
-        seconds = time.monotonic() - began
+        now = time.monotonic()
+        seconds, before = seconds + min(now - before, LONGEST_PAUSE_S), now
         if done:
             break
         if seconds > TIME_LIMIT_S:
@@ -224,15 +227,13 @@ def main() -> int:
     totals, by_kind, rss_mb = Counter[str](), defaultdict[str, Counter[str]](Counter), 0.0
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        sound: dict[str, Any] = {}
-        for own, case in cases(folder, count, options.seed):
-            if not sound:  # compiled and loaded before the first fork
-                sound = reading_of(folder / "control.mcap")
-                warm = Case("", ["compare", str(folder / "sound.mcap"), "-o", str(folder / "warm")])
-                try:
-                    sonar_graph(warm.command)
-                except SystemExit:
-                    print()
+        log = SoundLog.written(folder)
+        sound = reading_of(folder / "control.mcap")
+        try:  # compiled and loaded before the first fork
+            sonar_graph(["compare", str(log.path), "-o", str(folder / COMPARED)])
+        except SystemExit:
+            print()
+        for own, case in cases(log, count, options.seed):
             before = states(case.protected)
             outcome = run_apart(case, own)
             after = states(case.protected)
