@@ -28,7 +28,6 @@ from sonar_graph.measurements import (
 from sonar_graph.measurements import PAUSE_NS as PAUSE_NS
 from sonar_graph.states import LandmarkMap, Refusal, RefusedRow, Trajectory
 
-
 MOST_INSTANTS = 10_000_000
 """Two months at 2 Hz; a clock that was set meanwhile could ask for all memory."""
 
