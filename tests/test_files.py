@@ -9,7 +9,15 @@ from pathlib import Path
 import pytest
 
 from sonar_graph.errors import EvaluationError
-from sonar_graph.files import replacing, result_folder, result_written, write_json, written_whole
+from sonar_graph.files import (
+    others_in,
+    remove_written,
+    replacing,
+    result_folder,
+    result_written,
+    write_json,
+    written_whole,
+)
 
 KIND = "comparison"
 
@@ -182,6 +190,18 @@ def test_a_lock_is_of_one_folder_and_ends_with_the_block_also_by_an_error(tmp_pa
         with pytest.raises(EvaluationError, match="another command"), result_folder(tmp_path, KIND):
             pass
         write(tmp_path, {"a.json": "1"})
+
+
+@pytest.mark.parametrize("content", ["", "mine"])
+def test_a_file_with_the_name_of_the_lock_stays_where_nothing_is_written_or_a_run_is_removed(tmp_path, content):
+    (tmp_path / ".lock").write_text(content)
+    with result_folder(tmp_path, KIND):
+        pass
+    assert (tmp_path / ".lock").read_text() == content
+    write(tmp_path, {"a.json": "1"})
+    assert others_in(tmp_path) == ([".lock"] if content else [])
+    remove_written(tmp_path)
+    assert (tmp_path / ".lock").exists() == bool(content)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="other locks")

@@ -158,6 +158,7 @@ def result_folder(
     """
     place = path.absolute(), threading.get_ident()
     path.mkdir(parents=True, exist_ok=True)
+    is_new = not os.path.lexists(path / LOCK)
     flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
     descriptor = os.open(path / LOCK, flags, 0o666)
     try:
@@ -178,7 +179,7 @@ def result_folder(
             yield _held[place]
         finally:
             del _held[place]
-            if not (path / MANIFEST).exists():  # nothing was written
+            if is_new and not (path / MANIFEST).exists():  # nothing was written
                 (path / LOCK).unlink(missing_ok=True)
     finally:
         os.close(descriptor)
@@ -279,7 +280,9 @@ def _manifest_of(folder: Path) -> dict[str, Any]:
 
 def _written_in(folder: Path) -> set[Path]:
     """Files that a folder's manifest names, with manifest and lock, and a manifest that was half written."""
-    named = {MANIFEST, LOCK, *(path.name for path in folder.glob(f".{MANIFEST}.*.partial*"))}
+    lock = folder / LOCK
+    has_lock = lock.is_file() and not lock.is_symlink() and not lock.stat().st_size  # one with content is others'
+    named = {MANIFEST, *([LOCK] if has_lock else []), *(path.name for path in folder.glob(f".{MANIFEST}.*.partial*"))}
     named |= {name for name in _manifest_of(folder).get("files", ()) if _is_below(name)}
     return {folder / name for name in named}
 
