@@ -84,7 +84,7 @@ class Runner:
     def __init__(self) -> None:
         self._log = tempfile.TemporaryFile(mode="a+b")  # noqa: SIM115  it is open as long as the process runs
         environment = dict.fromkeys(ONE_THREAD, "1") | ONE_ORDER
-        self._process = OwnProcess(("-m", "sonar_graph.batch.one_run"), environment, self._log, is_leader=True)
+        self._process = OwnProcess(("-m", "sonar_graph.batch.one_run"), environment, self._log)
         self._is_busy = True
         self._is_foreign = False
         self._warm: set[str] = set()

@@ -33,8 +33,8 @@ class OwnProcess:
 
     ``program``: ``-m`` and a module, or ``-c`` and code.
 
-    With ``is_leader`` it and its children have a session of their own, which Ctrl-C in a terminal does not reach and
-    which `end` ends as a whole.
+    It and its children have a session of their own, which Ctrl-C in a terminal does not reach and which `end` ends as a
+    whole.
     """
 
     def __init__(
@@ -42,17 +42,14 @@ class OwnProcess:
         program: tuple[str, str],
         environment: Mapping[str, str] | None = None,
         log: IO[bytes] | None = None,
-        *,
-        is_leader: bool = False,
     ) -> None:
-        self._is_leader = is_leader
         self._process = subprocess.Popen(
             [sys.executable, "-P", *program],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=log,
             env=os.environ | dict(environment or {}),
-            start_new_session=is_leader,
+            start_new_session=True,
         )
         assert self._process.stdin is not None
         assert self._process.stdout is not None
@@ -62,11 +59,17 @@ class OwnProcess:
         self._collector.start()
 
     def _collect(self, source: BinaryIO) -> None:
-        """Put the answers of the process into the queue; None at their end."""
-        with source, contextlib.suppress(Exception):  # its end, or an answer of classes that are not known here
-            while True:
-                self._answers.put(pickle.load(source))
-        self._answers.put(None)
+        """Put the answers of the process into the queue; at their end None, or why one cannot be read."""
+        end = None
+        with source:
+            try:
+                while True:
+                    self._answers.put(_Answers(source).load())
+            except pickle.UnpicklingError as error:
+                end = KilledError(f"its answer cannot be read: {error}")
+            except Exception:  # it ended, perhaps in the middle of an answer
+                pass
+        self._answers.put(end)
 
     @property
     def pid(self) -> int:
@@ -107,12 +110,9 @@ class OwnProcess:
         return answer
 
     def end(self) -> None:
-        """Kill the process; of a leader also its children, which hold its pipe open."""
+        """Kill the process and its children, which hold its pipe open."""
         with contextlib.suppress(ProcessLookupError):
-            if self._is_leader:
-                os.killpg(self.pid, signal.SIGKILL)
-            else:
-                self._process.kill()
+            os.killpg(self.pid, signal.SIGKILL)
         self._process.wait()
         self._collector.join(JOIN_S)
         with contextlib.suppress(OSError):
@@ -126,6 +126,15 @@ class OwnProcess:
         if code >= 0:
             return f"its process ended with code {code}"
         return f"its process was ended by {signal.Signals(-code).name}"
+
+
+class _Answers(pickle.Unpickler):
+    """Reader of answers that loads no other package: its code would run here, and change what others compute."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        if module not in sys.modules and not module.startswith("sonar_graph."):
+            raise pickle.UnpicklingError(f"it has a {module}.{name}; expected a class of sonar_graph")
+        return super().find_class(module, name)
 
 
 def serve(handle: Callable[[Any, Tell], object]) -> NoReturn:

@@ -1,10 +1,12 @@
 """Estimators of other packages run in processes of their own, and what they do stays there."""
 
 import os
+import re
 import sys
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 
 from sonar_graph.errors import EstimatorError
@@ -13,9 +15,11 @@ from sonar_graph.evaluation import check_request, compare, run_estimator
 from sonar_graph.simulation import MissionOptions, simulate_mission
 
 PLUGIN = """
-import locale, os, signal, sys
+import locale, os, signal, subprocess, sys
+from dataclasses import fields
 import numpy as np
 from baselines.dead_reckoning import DeadReckoning
+from sonar_graph.states import Trajectory
 
 def meddle():
     np.sqrt = lambda value: 2.0 * value
@@ -37,6 +41,22 @@ class Meddling(DeadReckoning):
         meddle()
         return estimate
 
+class Trail(Trajectory):
+    pass
+
+class Subclassing(DeadReckoning):
+    def trajectory(self):
+        trajectory = super().trajectory()
+        return Trail(*(getattr(trajectory, column.name) for column in fields(trajectory)))
+
+class Leaving(DeadReckoning):
+    def process(self, measurements):
+        if not os.path.exists(os.environ["SONAR_GRAPH_CHILD"]):
+            child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+            with open(os.environ["SONAR_GRAPH_CHILD"], "w") as file:
+                file.write(str(child.pid))
+        return super().process(measurements)
+
 class Exits(DeadReckoning):
     def process(self, measurements):
         sys.exit(3)
@@ -53,7 +73,7 @@ class Interrupts(DeadReckoning):
     def process(self, measurements):
         raise KeyboardInterrupt("of its own")
 """
-CLASSES = ("Meddling", "Exits", "ExitsAtOnce", "Aborts", "Interrupts")
+CLASSES = ("Meddling", "Subclassing", "Leaving", "Exits", "ExitsAtOnce", "Aborts", "Interrupts")
 
 
 @pytest.fixture
@@ -111,12 +131,21 @@ def test_one_that_does_nothing_wrong_gives_the_numbers_that_it_gives_in_this_pro
         ("exitsatonce", "its process ended with code 4"),
         ("aborts", "its process was ended by SIGABRT"),
         ("interrupts", "KeyboardInterrupt: of its own"),
+        ("subclassing", r"its answer cannot be read: it has a theirs\.Trail; expected a class of sonar_graph"),
     ],
 )
 def test_the_end_of_a_process_is_the_failure_of_its_run_alone(plugin, mission, name, reason):
     comparison = compare(mission, [f"their-{name}", "dead-reckoning"])
     assert [run.status for run in comparison.runs] == ["failed", "ok"]
-    assert __import__("re").search(reason, comparison.runs[0].reason)
+    assert re.search(reason, comparison.runs[0].reason)
+    assert "theirs" not in sys.modules
+
+
+def test_processes_that_an_estimator_leaves_behind_end_with_its_own(plugin, mission, tmp_path, monkeypatch):
+    monkeypatch.setenv("SONAR_GRAPH_CHILD", str(tmp_path / "child"))
+    assert run_estimator(mission, "their-leaving").status == "ok"
+    child = int((tmp_path / "child").read_text())
+    assert not psutil.pid_exists(child) or psutil.Process(child).status() == psutil.STATUS_ZOMBIE
 
 
 def test_sys_exit_while_it_is_loaded_is_told_as_such(plugin, mission, monkeypatch):
