@@ -126,7 +126,8 @@ def _return_rows(truth: Trajectory | None, paths: list[Trajectory | None]) -> li
             at = None
             if truth is not None:
                 ends_ns = np.clip(path.stamps_ns[[0, -1]], truth.stamps_ns[0], truth.stamps_ns[-1])
-                at = float(displacement(truth.at(ends_ns))[axis])
+                if ends_ns[0] < ends_ns[1]:  # else they have no time in common
+                    at = float(displacement(truth.at(ends_ns))[axis])
             cells.append(_with_difference(float(displacement(path)[axis]), at, DECIMALS))
             first = _with_difference(at, None, DECIMALS) if place == 0 else first
         rows.append([f"last minus first position, {'xy'[axis]}", first, *cells])
