@@ -127,6 +127,11 @@ def bless(batch: RecordedBatch, path: Path) -> None:
     write_json(path, content | {"runs": entries})
 
 
+def is_reference(content: dict[str, Any]) -> bool:
+    """True for the content of a file that `bless` wrote, also in an earlier format."""
+    return str(content.get("format")).startswith(FORMAT.rstrip("0123456789"))
+
+
 def gate(batch: RecordedBatch, reference: Path) -> GateVerdict:
     """Judge a batch by a blessed reference.
 

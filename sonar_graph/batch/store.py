@@ -27,6 +27,7 @@ from sonar_graph.errors import BatchError, EvaluationError
 from sonar_graph.files import (
     COMPARISON,
     DIGEST_DIGITS,
+    changed_in,
     others_in,
     read_json,
     remove_written,
@@ -168,12 +169,12 @@ class Store:
     def discard(self, key: str) -> None:
         """Remove a run, so that it is done again.
 
-        Raises `BatchError` when its folder holds files that this package did not write.
+        Raises `BatchError` when its folder holds files that this package did not write, or that were changed since.
         """
         folder, gone = self.run_folder(key), self._partial_folder(key)
-        if others := others_in(folder):
+        if others := [*others_in(folder), *changed_in(folder)]:
             raise BatchError(
-                f"{folder}: would be replaced, and holds {others[0]}, which is not of the run; move it away"
+                f"{folder}: would be replaced, and holds {others[0]}, which is not as the run wrote it; move it away"
             )
         with contextlib.suppress(FileNotFoundError):
             folder.rename(gone)

@@ -190,14 +190,17 @@ benches.command(
 @benches.command(epilog=examples("sonar-graph bench bless results reference.json"))
 def bless(
     folder: BatchFolder,
-    reference: Annotated[Path, typer.Argument(metavar="REFERENCE.json", help="File to write; replaced if it exists.")],
+    reference: Annotated[
+        Path, typer.Argument(metavar="REFERENCE.json", help="File to write; replaces an earlier reference.")
+    ],
+    overwrite: Overwrite = False,
 ) -> None:
     """Make a batch the reference that later ones are held against."""
     from sonar_graph.batch import bless as write_reference
-    from sonar_graph.batch import read_batch
+    from sonar_graph.batch import is_reference, read_batch
 
     batch = read_batch(folder)
-    write_reference(batch, writable_json(reference, []))
+    write_reference(batch, writable_json(reference, [], is_reference, overwrite=overwrite))
     failed = sum(not run.ended for run in batch.runs)
     echo(f"Reference: {reference} ({len(batch.runs)} runs, {failed} of which did not end)")
 

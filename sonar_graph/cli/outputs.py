@@ -4,16 +4,17 @@ Files that the user wrote are never overwritten.
 """
 
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryFile
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from sonar_graph.cli.arguments import printable
 from sonar_graph.errors import EvaluationError, LogError, SonarGraphError
-from sonar_graph.files import COMPARISON, result_folder
+from sonar_graph.files import COMPARISON, read_json, result_folder
 
 
 def writable_log(path: Path, source: Path | None = None, *, overwrite: bool = False) -> Path:
@@ -36,12 +37,25 @@ def writable_log(path: Path, source: Path | None = None, *, overwrite: bool = Fa
     return path
 
 
-def writable_json(path: Path, sources: Iterable[Path]) -> Path:
-    """Check that a JSON file can be written, make its folder, and return ``path``."""
+def writable_json(
+    path: Path, sources: Iterable[Path], is_own: Callable[[dict[str, Any]], bool], *, overwrite: bool = False
+) -> Path:
+    """Check that a JSON file can be written, make its folder, and return ``path``.
+
+    Raises `EvaluationError` when it is one of the sources, cannot be written, or has a content that is not ``is_own``.
+    """
     if path.is_dir() or path.suffix != ".json":
         raise EvaluationError(f"{path}: expected the name of a file that ends in .json")
     if any(_is_part_of(path, source) for source in sources):
         raise EvaluationError(f"{path}: is what is read, and would be overwritten; choose another name with -o")
+    if not overwrite and path.exists() and (not path.is_file() or path.stat().st_size):
+        content: dict[str, Any] = {}
+        with suppress(EvaluationError):
+            content = read_json(path)
+        if not is_own(content):
+            raise EvaluationError(
+                f"{path}: exists, and sonar-graph did not write it; choose another name, or give --overwrite"
+            )
     _require_writing_in(path.parent, path, EvaluationError)
     return path
 

@@ -180,11 +180,12 @@ def calibrate(
     reading: ReadingOptions,
     designs: DesignsPath = None,
     settings: Settings = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Measure how often landmarks look like which, on logs with sonar images whose truth is known."""
     from sonar_graph.recognition import calibrate as measure
 
-    path = writable_json(output, logs)
+    path = writable_json(output, logs, lambda content: "ids" in content and "matrix" in content, overwrite=overwrite)
     for row, log in enumerate(logs):
         if any(log.samefile(other) for other in logs[:row]):
             raise LogError(f"{log}: is named twice, and its frames would count twice; name each log once")

@@ -26,6 +26,7 @@ from sonar_graph.evaluation.scores import (
     resource_scores,
     trajectory_scores,
 )
+from sonar_graph.files import spelt
 from sonar_graph.measurements import Ints
 from sonar_graph.sequence import Sequence, require_sequence
 from sonar_graph.states import Trajectory
@@ -53,7 +54,7 @@ def describe_environment() -> dict[str, str]:
         **library_versions(),
         "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} processors",
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "command": shlex.join(command),
+        "command": spelt(shlex.join(command)),
     }
 
 

@@ -35,6 +35,11 @@ def text_of(path: Path, encoding: str = "utf-8") -> str:
     return path.read_text(encoding)
 
 
+def spelt(text: str) -> str:
+    """The same text with bytes of file names that are not UTF-8 spelt out, so that it can be written."""
+    return text.encode("utf-8", "backslashreplace").decode()
+
+
 def strict_json(content: dict[str, Any]) -> str:
     """JSON text; NaN and infinity become null."""
     return json.dumps(_strict(content), indent=2, allow_nan=False, ensure_ascii=False)

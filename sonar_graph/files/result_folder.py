@@ -293,6 +293,13 @@ def others_in(folder: Path) -> list[str]:
     return sorted(path.relative_to(folder).as_posix() for path in there - _written_in(folder))
 
 
+def changed_in(folder: Path) -> list[str]:
+    """Names of the files in a folder that somebody changed since they were written; an empty one holds nothing."""
+    named = {folder / name: name for name in _manifest_of(folder).get("files", ()) if _is_below(name)}
+    whole = {path: name for path, name in named.items() if path.is_file() and path.stat().st_size}
+    return [name for path, name in whole.items() if digest_of(path) not in _manifest_of(folder)["files"][name]]
+
+
 def remove_written(folder: Path) -> None:
     """Remove a folder with the files that its manifest names; others' files stay, and the folder with them."""
     links = {path for path in folder.rglob("*") if path.is_symlink() and path.is_dir()}
@@ -323,7 +330,6 @@ def written_whole(path: Path) -> Iterator[BinaryIO]:
     Raises `LogError` when the file cannot be written.
     """
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as partial, partial.open("wb") as stream:
             yield stream
     except OSError as error:

@@ -13,7 +13,7 @@ import numpy as np
 
 from sonar_graph.calibration import Calibration, Mounting
 from sonar_graph.errors import LogError
-from sonar_graph.files import as_path
+from sonar_graph.files import as_path, spelt
 from sonar_graph.images import SonarFrames
 from sonar_graph.logs.adapters import (
     DepthAdapter,
@@ -333,7 +333,7 @@ class Assembly:
             "log.noise": list(unsaid_noise(blocks)),
         }
         self._notes |= {subject: "; ".join(texts) for subject, texts in findings.items() if texts}
-        name = name or recorded_name(self._recording) or self._recording.path.stem
+        name = name or recorded_name(self._recording) or spelt(self._recording.path.stem)
         return Sequence(name=name, calibration=self.calibration, notes=self._notes, **blocks)
 
     def survey(self) -> tuple[list[str], list[str]]:

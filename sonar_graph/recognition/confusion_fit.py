@@ -15,6 +15,7 @@ from scipy.special import expit
 
 from sonar_graph.devices import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.errors import CalibrationError, LogError
+from sonar_graph.files import spelt
 from sonar_graph.logs import read_sonar_frames
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.measurements import Floats, Ints
@@ -168,7 +169,7 @@ def calibrate(
                     gathered.add(sighting, (log, track), run.true_landmarks.ids, range_m, azimuth_rad)
         if not session.result.frames:
             raise LogError(no_images(path))
-    names = ", ".join(path.name for path, _ in logs)
+    names = spelt(", ".join(path.name for path, _ in logs))
     kinds = "; ".join(dict.fromkeys(run.notes.get("ours", "recorded") for _, run in logs))
     return estimate_confusion(gathered.fits(), gathered.ids, {"logs": names, "what they are": kinds}, designs)
 

@@ -112,6 +112,12 @@ def test_row_that_the_machine_lost_or_that_is_of_another_run_counts_as_not_done(
 def test_others_files_in_the_folder_of_a_run_or_beside_it_are_never_removed(tmp_path):
     store = Store(tmp_path)
     store.write("k", OUTCOME)
+    (store.run_folder("k") / "log.txt").write_text("mine")
+    for act in (lambda: store.discard("k"), lambda: store.write("k", OUTCOME)):
+        with pytest.raises(BatchError, match=r"runs/k: would be replaced, and holds log\.txt, .*move it away"):
+            act()
+    assert (store.run_folder("k") / "log.txt").read_text() == "mine"
+    (store.run_folder("k") / "log.txt").write_text(OUTCOME.log)
     notes = [
         store.run_folder("k") / "notes.txt",
         *(tmp_path / "runs" / name / "a" for name in ("mine", ".partial-mine")),

@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+import sonar_graph
 from sonar_graph.batch.gate import GateVerdict
 from sonar_graph.cli.bench import verdict_lines
 
@@ -57,6 +58,7 @@ def test_missing_packages_are_named_with_how_to_get_them(run, tmp_path, capsys, 
     (tmp_path / "suite.toml").touch()
     for name in [name for name in sys.modules if name.startswith("sonar_graph.batch")]:
         monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setattr(sonar_graph, "batch", sonar_graph.batch)  # back to the modules that are known by now
     monkeypatch.setitem(sys.modules, "distributed", None)
     assert run("bench", tmp_path / "suite.toml", "-o", tmp_path / "out") == 2
     assert "pip install 'sonar-graph[bench]'" in capsys.readouterr().err
@@ -125,6 +127,17 @@ def test_no_more_than_ten_runs_that_stand_out_are_printed():
     assert len([line for line in lines if line.startswith("Look at: run")]) == 10
     assert "Look at: 2 more such lines are not shown" in lines
     assert any("No test of errors: isam2 (2)" in line for line in lines)
+
+
+@pytest.mark.parametrize("content", ['{"a": 1}', "words", "[]"])
+def test_a_json_file_of_others_is_replaced_only_when_asked_for(content, basin, run, tmp_path, capsys):
+    mine, folder = tmp_path / "mine.json", batch(tmp_path / "batch")
+    mine.write_text(content)
+    for command in (("calibrate", basin, "-o", mine), ("bench", "bless", folder, mine)):
+        assert run(*command) == 2
+        assert "did not write it; choose another name, or give --overwrite" in capsys.readouterr().err
+    assert mine.read_text() == content
+    assert run("bench", "bless", folder, mine, "--overwrite") == run("bench", "bless", folder, mine) == 0
 
 
 def test_an_incomplete_batch_is_neither_blessed_nor_judged(run, tmp_path, capsys):

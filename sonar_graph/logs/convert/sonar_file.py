@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from sonar_graph.calibration import Calibration, SonarCalibration, SonarImage
 from sonar_graph.errors import DatasetError
-from sonar_graph.files import regular
+from sonar_graph.files import regular, spelt
 from sonar_graph.images import SonarFrames
 from sonar_graph.logs.mcap import Progress, recording
 from sonar_graph.logs.vehicle_setup import METADATA, recorded_calibration
@@ -330,7 +330,7 @@ def convert_sonar_file(
     """Write all whole frames to an MCAP log; memory holds a few of them at a time."""
     conversion = SonarConversion(promised=kind.frames_promised)
     calibration = Calibration(sonar=SonarCalibration(image=kind.image))
-    record = {"name": source.path.stem, "calibration": recorded_calibration(calibration)}
+    record = {"name": spelt(source.path.stem), "calibration": recorded_calibration(calibration)}
     with recording(output, {METADATA: record | {"notes": json.dumps(dict(kind.notes))}}) as out:
         for block in _blocks(frames_and_losses(source, kind), kind.clock_period_ns, conversion):
             heads, stamps_ns = zip(*block, strict=True)
