@@ -22,7 +22,7 @@ from sonar_graph.cli.inspect_log import inspect
 from sonar_graph.cli.recognise import calibrate, recognise
 from sonar_graph.cli.simulate import worlds
 from sonar_graph.errors import SonarGraphError
-from sonar_graph.files import INTERRUPTED, end_at_once, noticed_interrupts
+from sonar_graph.files import INTERRUPTED, end_at_once, noticed_interrupts, terminations_as_interrupts
 from sonar_graph.version import __version__
 
 MISTAKE = 2
@@ -84,7 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command and exit with its code; the entry point of ``sonar-graph``."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        with noticed_interrupts() as check:
+        with terminations_as_interrupts(), noticed_interrupts() as check:
             try:
                 code = _run(given)
             finally:  # compiled code may have made another exception of Ctrl-C, or none

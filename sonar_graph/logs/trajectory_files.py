@@ -115,7 +115,6 @@ def read_landmarks_csv(path: Path) -> LandmarkMap:
 
 def _write(path: Path, text: str) -> None:
     try:
-        Path(path).parent.mkdir(parents=True, exist_ok=True)
         with replacing(Path(path)) as partial:
             partial.write_text(text, encoding="utf-8")
     except OSError as error:

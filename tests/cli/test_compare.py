@@ -2,6 +2,10 @@
 
 import json
 import re
+import signal
+import subprocess
+import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -49,6 +53,26 @@ def test_compare_says_where_the_report_is_and_report_draws_the_same_page_again(r
     page.unlink()
     assert run("report", tmp_path) == 0
     assert len(page.read_text()) == pytest.approx(len(before), rel=0.01)
+
+
+def test_names_that_are_not_utf_8_are_read_and_spelt_out_where_they_are_told(run, basin, tmp_path, capsys):
+    odd = basin.rename(tmp_path / "odd\udcff.mcap")
+    assert run("compare", odd, "-o", tmp_path / "out\udcff", "--estimators", "dead-reckoning") == 0
+    assert run("report", tmp_path / "out\udcff") == 0
+    assert "out\\udcff/report.html" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_comparison_in_one_line_and_leaves_nothing_of_it(basin, tmp_path, number):
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "sonar_graph", "compare", str(basin), "-o", str(out), "--rate-hz", "10"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        while process.poll() is None and not (out / ".lock").exists():
+            time.sleep(0.01)
+        process.send_signal(number)
+        _, said = process.communicate(timeout=60)
+    assert (process.returncode, said) == (130, b"sonar-graph: interrupted\n")
+    assert not list(out.iterdir())
 
 
 def test_failed_run_is_written_and_reported_by_exit_code(run, basin, tmp_path, monkeypatch, capsys):
