@@ -23,8 +23,8 @@ from sonar_graph.logs import write_log
 from sonar_graph.testing import small_world
 
 MAGIC = b"\x89MCAP0\r\n"
-COMPARED = "compared"
-"""Folder beside the sound log in which it is compared."""
+COMPARED, BATCH, SUITE, IMAGED = "compared", "batch", "suite.toml", "imaged.mcap"
+"""Beside the sound log: folders with a comparison and a batch of it, the batch's suite, and a log with images."""
 NOISE = (  # what terminals, pages, spreadsheets and file systems might obey
     *("\x1b[2J\x1b]0;owned\x07", "\x9b31m", "\x00", "a\rb", "\u202e/imu", "=cmd|' /C calc'!A0", "+1+1", "@SUM(A1)"),
     *("<script>alert(1)</script>", "../../etc/passwd", "/" * 300, "x" * 100_000, "[red]a[/red]", "%s%n{0}", "\n\n", ""),
@@ -457,10 +457,25 @@ THEIRS = (
 
 
 def folders(log: SoundLog, folder: Path, rng: Rng) -> Case:
-    """Users' files, links and pipes where results go."""
+    """Users' files, links and pipes where results go, with or without earlier results."""
     out, elsewhere = folder / "out", folder / "elsewhere"
-    for path in (out, elsewhere):
-        path.mkdir()
+    sound, quick = str(log.path), ["--estimator", "dead-reckoning"]
+    commands = [
+        ["run", sound, "-o", str(out), *quick],
+        ["run", sound, "-o", str(out), *quick],
+        ["compare", sound, "-o", str(out), "--estimators", "dead-reckoning"],
+        ["convert", "victoria-park", "-o", str(out / "log.mcap")],
+        ["simulate", "landmarks", "--on", sound, "-o", str(out / "log.mcap")],
+        ["recognise", str(log.path.parent / IMAGED), "-o", str(out / "log.mcap")],
+        ["report", str(out)],
+        ["bench", str(log.path.parent / SUITE), "-o", str(out), "--workers", "1"],
+        ["bench", "bless", str(log.path.parent / BATCH), str(out / "comparison.json")],
+        ["calibrate", sound, "-o", str(out / "comparison.json")],
+    ]
+    command = commands[int(rng.integers(len(commands)))]
+    earlier = (None, BATCH, COMPARED)[int(rng.integers(command[0] == "bench", 3))]  # a new batch takes too long
+    elsewhere.mkdir()
+    shutil.copytree(log.path.parent / earlier, out) if earlier else out.mkdir()
     precious = elsewhere / "precious"
     precious.write_text("mine")
     protected = [precious]
@@ -472,8 +487,7 @@ def folders(log: SoundLog, folder: Path, rng: Rng) -> Case:
             path.parent.symlink_to(elsewhere)
         path.parent.mkdir(parents=True, exist_ok=True)
         which = rng.random()
-        if os.path.lexists(path):
-            continue
+        path.unlink(missing_ok=True)
         if which < 0.15:
             path.symlink_to(precious)
         elif which < 0.2:
@@ -481,20 +495,7 @@ def folders(log: SoundLog, folder: Path, rng: Rng) -> Case:
         else:
             path.write_bytes(bytes(rng.integers(0, 256, 40, np.uint8)) if which < 0.6 else manifest(rng, precious))
         protected.append(path)
-    sound, quick = str(log.path), ["--estimator", "dead-reckoning"]
-    commands = [
-        ["run", sound, "-o", str(out), *quick],
-        ["run", sound, "-o", str(out), *quick],
-        ["compare", sound, "-o", str(out), "--estimators", "dead-reckoning"],
-        ["convert", "victoria-park", "-o", str(out / "log.mcap")],
-        ["simulate", "basin", "--duration-s", "70", "--laps", "1", "-o", str(out / "log.mcap")],
-        ["recognise", sound, "-o", str(out / "log.mcap")],
-        ["report", str(out)],
-        ["bench", str(folder / "suite.toml"), "-o", str(out)],
-        ["calibrate", sound, "-o", str(out / "comparison.json")],
-    ]
-    (folder / "suite.toml").write_text('name = "s"\nreference = "dead-reckoning"\nlogs = []\nestimators = []\n')
-    return Case("folders", commands[int(rng.integers(len(commands)))], protected)
+    return Case("folders", command, protected)
 
 
 def manifest(rng: Rng, precious: Path) -> bytes:
@@ -510,7 +511,9 @@ def results(log: SoundLog, folder: Path, rng: Rng) -> Case:
     """Files of a comparison that somebody changed since."""
     out = folder / "out"
     shutil.copytree(log.path.parent / COMPARED, out)
-    changed = rng.choice(sorted(path for path in out.rglob("*") if path.is_file()), int(rng.integers(1, 4)))
+    changed = rng.choice(
+        sorted(path for path in out.rglob("*") if path.is_file()), int(rng.integers(1, 4)), replace=False
+    )
     for path in (Path(one) for one in changed):
         content, which = bytearray(path.read_bytes()), rng.integers(6)
         for at in rng.integers(0, max(len(content), 1), int(rng.integers(1, 6))) if content else ():

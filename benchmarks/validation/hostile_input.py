@@ -13,6 +13,7 @@ that do not end with "interrupted", exit code 130, and no file in the folder or 
 when all was done.
 """
 
+import contextlib
 import csv
 import hashlib
 import io
@@ -38,7 +39,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ[variable] = "1"  # processes are forked
 from common import make_parser, note, print_figures, print_table
-from hostile_files import COMPARED, NOISE, Case, SoundLog, cases
+from hostile_files import BATCH, COMPARED, IMAGED, NOISE, SUITE, Case, SoundLog, cases
 
 from sonar_graph.cli import main as sonar_graph
 from sonar_graph.logs import read_log, write_log
@@ -50,6 +51,12 @@ TIME_LIMIT_S, INTERRUPT_S = 10.0, 30.0
 LONGEST_PAUSE_S = 0.5
 """Longer ones between two looks at a command are those of a machine that stood still."""
 MOST_RSS_MB = 1500.0
+SUITE_TEXT = """
+name = "hostile"
+reference = "dead-reckoning"
+logs = [{{ name = "sound", log = "{log}" }}]
+estimators = [{{ name = "dead-reckoning" }}]
+"""
 TARGETS = {"tracebacks": 0, "hangs": 0, "silent_errors": 0, "files_lost": 0, "interrupts_missed": 0}
 
 
@@ -229,10 +236,16 @@ def main() -> int:
         folder = Path(scratch)
         log = SoundLog.written(folder)
         sound = reading_of(folder / "control.mcap")
-        try:  # compiled and loaded before the first fork
-            sonar_graph(["compare", str(log.path), "-o", str(folder / COMPARED)])
-        except SystemExit:
-            print()
+        (folder / SUITE).write_text(SUITE_TEXT.format(log=log.path))
+        images = ["--duration-s", "119", "--laps", "1", "--images", "--set", "frame_rate_hz=0.3"]
+        for command in (  # compiled and loaded before the first fork
+            ["compare", str(log.path), "-o", str(folder / COMPARED)],
+            ["simulate", "basin", *images, "-o", str(folder / IMAGED)],
+        ):
+            with contextlib.suppress(SystemExit):
+                sonar_graph(command)
+        batch = ["bench", str(folder / SUITE), "-o", str(folder / BATCH), "--workers", "1"]
+        subprocess.run([sys.executable, "-m", "sonar_graph", *batch], check=True, capture_output=True)
         for own, case in cases(log, count, options.seed):
             before = states(case.protected)
             outcome = run_apart(case, own)
