@@ -6,6 +6,7 @@ to stderr. A process ends with its stdin, so it never outlives the one that star
 
 import contextlib
 import faulthandler
+import io
 import os
 import pickle
 import signal
@@ -13,10 +14,11 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Mapping
+from dataclasses import fields, is_dataclass
 from queue import Empty, SimpleQueue
 from typing import IO, Any, BinaryIO, NoReturn
 
-READY = "ready"
+READY, OWN = "ready", "sonar_graph."
 LOOK_EVERY_S = 0.2
 JOIN_S = 5.0
 """Longest wait for the thread that listens to an ended process, whose detached children may keep the pipe open."""
@@ -132,9 +134,19 @@ class _Answers(pickle.Unpickler):
     """Reader of answers that loads no other package: its code would run here, and change what others compute."""
 
     def find_class(self, module: str, name: str) -> Any:
-        if module not in sys.modules and not module.startswith("sonar_graph."):
+        if module not in sys.modules and not module.startswith(OWN):
             raise pickle.UnpicklingError(f"it has a {module}.{name}; expected a class of sonar_graph")
         return super().find_class(module, name)
+
+
+class _Plain(pickle.Pickler):
+    """Writer of answers, in which what has a class derived from one of sonar_graph has that one."""
+
+    def reducer_override(self, value: object) -> Any:
+        kind = next((one for one in type(value).__mro__ if one.__module__.startswith(OWN)), None)
+        if kind in (None, type(value)) or not is_dataclass(kind):
+            return NotImplemented
+        return kind, tuple(getattr(value, column.name) for column in fields(kind))
 
 
 def serve(handle: Callable[[Any, Tell], object]) -> NoReturn:
@@ -152,11 +164,12 @@ def serve(handle: Callable[[Any, Tell], object]) -> NoReturn:
         os._exit(0)
 
     def tell(content: object) -> None:
+        packed = io.BytesIO()
         try:
-            packed = pickle.dumps(content)
+            _Plain(packed).dump(content)
         except Exception:
-            packed = pickle.dumps(RuntimeError(f"{type(content).__name__}: {content}"))
-        answers.write(packed)
+            packed = io.BytesIO(pickle.dumps(RuntimeError(f"{type(content).__name__}: {content}")))
+        answers.write(packed.getvalue())
         answers.flush()
 
     threading.Thread(target=listen, daemon=True).start()

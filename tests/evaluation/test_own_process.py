@@ -49,6 +49,13 @@ class Subclassing(DeadReckoning):
         trajectory = super().trajectory()
         return Trail(*(getattr(trajectory, column.name) for column in fields(trajectory)))
 
+class Word(str):
+    pass
+
+class Wording(DeadReckoning):
+    def withheld(self):
+        return [Word("mine")]
+
 class Leaving(DeadReckoning):
     def process(self, measurements):
         if not os.path.exists(os.environ["SONAR_GRAPH_CHILD"]):
@@ -73,7 +80,7 @@ class Interrupts(DeadReckoning):
     def process(self, measurements):
         raise KeyboardInterrupt("of its own")
 """
-CLASSES = ("Meddling", "Subclassing", "Leaving", "Exits", "ExitsAtOnce", "Aborts", "Interrupts")
+CLASSES = ("Meddling", "Subclassing", "Wording", "Leaving", "Exits", "ExitsAtOnce", "Aborts", "Interrupts")
 
 
 @pytest.fixture
@@ -131,13 +138,20 @@ def test_one_that_does_nothing_wrong_gives_the_numbers_that_it_gives_in_this_pro
         ("exitsatonce", "its process ended with code 4"),
         ("aborts", "its process was ended by SIGABRT"),
         ("interrupts", "KeyboardInterrupt: of its own"),
-        ("subclassing", r"its answer cannot be read: it has a theirs\.Trail; expected a class of sonar_graph"),
+        ("wording", r"its answer cannot be read: it has a theirs\.Word; expected a class of sonar_graph"),
     ],
 )
 def test_the_end_of_a_process_is_the_failure_of_its_run_alone(plugin, mission, name, reason):
     comparison = compare(mission, [f"their-{name}", "dead-reckoning"])
     assert [run.status for run in comparison.runs] == ["failed", "ok"]
     assert re.search(reason, comparison.runs[0].reason)
+    assert "theirs" not in sys.modules
+
+
+def test_results_of_classes_of_its_own_are_taken_as_ours(plugin, mission):
+    own, theirs = compare(mission, ["dead-reckoning", "their-subclassing"]).runs
+    assert own.smoothed.covariances.tobytes() == theirs.smoothed.covariances.tobytes()
+    assert type(theirs.smoothed) is type(own.smoothed)
     assert "theirs" not in sys.modules
 
 
