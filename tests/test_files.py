@@ -10,6 +10,7 @@ import pytest
 
 from sonar_graph.errors import EvaluationError
 from sonar_graph.files import (
+    kind_of,
     others_in,
     remove_written,
     replacing,
@@ -125,6 +126,42 @@ def test_killed_between_two_files_all_are_still_known_as_ours(tmp_path, monkeypa
     assert contents(tmp_path) == {"a.json": "3", "b.json": "3"}
 
 
+WRITER = """
+import os, sys
+from pathlib import Path
+from sonar_graph.files import replacing, result_written
+
+with result_written(Path(sys.argv[1]), "comparison"), replacing(Path(sys.argv[1]) / "runs" / "a.json") as partial:
+    partial.write_text("half")
+    with replacing(Path(sys.argv[1]) / "b.json") as other:
+        other.write_text("half")
+    os.kill(os.getpid(), 9)
+"""
+
+
+@pytest.mark.parametrize("is_new", [False, True])
+def test_what_a_killed_command_left_is_removed_by_the_next_one_and_nothing_else(tmp_path, is_new):
+    if not is_new:
+        write(tmp_path, {"a.json": "1"})
+    mine = {f".{name}.{'0' * 24}.partial.json": "mine" for name in "ab"}
+    for name, content in mine.items():
+        (tmp_path / name).write_text(content)
+    assert subprocess.run([sys.executable, "-c", WRITER, str(tmp_path)], check=False).returncode == -9
+    assert len(contents(tmp_path)) == len(mine) + 2 + (not is_new)
+    write(tmp_path, {"a.json": "2"})
+    assert contents(tmp_path) == mine | {"a.json": "2"}
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_folder_without_files_stays_of_its_kind_and_one_that_failed_has_none(tmp_path):
+    with pytest.raises(RuntimeError):
+        write(tmp_path / "failed", {"a.json": "1"}, error=RuntimeError)
+    assert not list((tmp_path / "failed").iterdir())
+    with result_written(tmp_path / "empty", "batch"):
+        pass
+    assert kind_of(tmp_path / "empty") == "batch"
+
+
 @pytest.mark.parametrize(
     "manifest", ["", "[]", '{"kind": "comparison"}', '{"format": 1, "kind": "x", "files": 3}', "[" * 9999]
 )
@@ -202,6 +239,22 @@ def test_a_file_with_the_name_of_the_lock_stays_where_nothing_is_written_or_a_ru
     assert others_in(tmp_path) == ([".lock"] if content else [])
     remove_written(tmp_path)
     assert (tmp_path / ".lock").exists() == bool(content)
+
+
+def test_a_lock_that_is_a_link_or_a_folder_is_refused(tmp_path):
+    (tmp_path / "mine").write_text("mine")
+    for folder, make in (
+        (tmp_path / "a", lambda lock: lock.symlink_to(tmp_path / "mine")),
+        (tmp_path / "b", Path.mkdir),
+    ):
+        folder.mkdir()
+        make(folder / ".lock")
+        with (
+            pytest.raises(EvaluationError, match=r"\.lock: cannot be opened .*choose another"),
+            result_folder(folder, KIND),
+        ):
+            pass
+    assert (tmp_path / "mine").read_text() == "mine"
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="other locks")

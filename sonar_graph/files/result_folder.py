@@ -2,13 +2,15 @@
 
 A folder of results has a manifest, ``.sonar_graph.json``, with the digest of every file in it that this package wrote.
 Only these are replaced or removed, and only while they are as they were written. All files of a result change together,
-when it is complete. Temporary files are new ones with random names, so that no other file and no link is written to.
+when it is complete. Temporary files are new ones with random names, so that no other file and no link is written to; a
+part of their names is in the manifest meanwhile, and what a killed command left is removed by the next one.
 """
 
 import contextlib
 import hashlib
 import json
 import os
+import re
 import secrets
 import sys
 import threading
@@ -29,6 +31,7 @@ DIGEST_DIGITS = 32
 _NAMED = 4
 """Most files that an error names."""
 _LONGEST_NAME = 100
+_TOKEN = re.compile("(?:[0-9a-f]{12})?")
 
 
 class ResultFolder:
@@ -43,6 +46,7 @@ class ResultFolder:
         self._digests: dict[str, list[str]] = {}
         self._staged: dict[str, Path] = {}
         self._gone: set[str] = set()
+        self.token = ""
         manifest = path / MANIFEST
         if not os.path.lexists(manifest):
             return
@@ -52,12 +56,15 @@ class ResultFolder:
             content = json.loads(text_of(manifest))
             found, self._digests = content["kind"], content["files"]
             is_sound = all(isinstance(digests, list) and _is_below(name) for name, digests in self._digests.items())
+            is_sound &= _TOKEN.fullmatch(left := content.get("unfinished", "")) is not None
             if content["format"] != FORMAT or not is_sound:
                 raise ValueError(f"expected the format {FORMAT!r}")
         except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise refusal(f"{manifest}: is not as sonar-graph writes it ({error}); choose another folder") from error
         if found != kind:
             raise refusal(f"{path}: holds a {found}, and would become a {kind}; choose another folder with -o")
+        for partial in [*path.glob(f".{MANIFEST}.*.partial*"), *(path.glob(f".*.{left}*.partial*") if left else ())]:
+            partial.unlink(missing_ok=True)
 
     @property
     def names(self) -> list[str]:
@@ -103,16 +110,24 @@ class ResultFolder:
 
     @contextmanager
     def _transaction(self) -> Iterator[None]:
-        self.is_writing = True
+        self.is_writing, self.token = True, secrets.token_hex(6)
+        is_kept = os.path.lexists(self.path / MANIFEST)
         try:
+            self._write_manifest()
             yield
             self._commit()
+            is_kept = True
         finally:
             for partial in self._staged.values():
                 partial.unlink(missing_ok=True)
             self._staged.clear()
             self._gone.clear()
-            self.is_writing = False
+            self.is_writing, self.token = False, ""
+            with contextlib.suppress(OSError):  # then the next command removes what is no longer there
+                if is_kept or self._digests:
+                    self._write_manifest()
+                else:
+                    (self.path / MANIFEST).unlink(missing_ok=True)
 
     def _commit(self) -> None:
         """Remove and replace; killed in between, the manifest names both contents of each file."""
@@ -131,10 +146,9 @@ class ResultFolder:
                 partial.replace(self.path / name)
             kept = {name: digests for name, digests in self._digests.items() if name not in self._gone}
             self._digests = kept | {name: [digest] for name, digest in new.items()}
-            self._write_manifest()
 
     def _write_manifest(self) -> None:
-        write_manifest(self.path, self.kind, self._digests)
+        write_manifest(self.path, self.kind, self._digests, self.token)
 
 
 _held: dict[tuple[Path, int], ResultFolder] = {}
@@ -160,7 +174,13 @@ def result_folder(
     path.mkdir(parents=True, exist_ok=True)
     is_new = not os.path.lexists(path / LOCK)
     flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
-    descriptor = os.open(path / LOCK, flags, 0o666)
+    try:
+        descriptor = os.open(path / LOCK, flags, 0o666)
+    except OSError as error:
+        raise refusal(
+            f"{path / LOCK}: cannot be opened to keep other commands out ({error.strerror}); choose another folder "
+            "with -o"
+        ) from error
     try:
         try:
             _lock(descriptor)
@@ -230,7 +250,7 @@ def replacing(path: Path) -> Iterator[Path]:
         folder.require([name])
     if folder is None:
         path.parent.mkdir(parents=True, exist_ok=True)
-    partial = _new_file(path if folder is None else folder.path / path.name)
+    partial = _new_file(path) if folder is None else _new_file(folder.path / path.name, folder.token)
     try:
         yield partial
         if folder is None:
@@ -242,18 +262,22 @@ def replacing(path: Path) -> Iterator[Path]:
         raise
 
 
-def _new_file(path: Path) -> Path:
+def _new_file(path: Path, token: str = "") -> Path:
     """An empty file beside a path, which nothing else has or links to."""
-    partial = path.with_name(f".{path.name[:_LONGEST_NAME]}.{secrets.token_hex(6)}.partial{path.suffix}")
+    partial = path.with_name(f".{path.name[:_LONGEST_NAME]}.{token}{secrets.token_hex(6)}.partial{path.suffix}")
     os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
     return partial
 
 
-def write_manifest(folder: Path, kind: str, digests: dict[str, list[str]]) -> None:
-    """Write the manifest of a folder: the digests of each file that is this package's."""
+def write_manifest(folder: Path, kind: str, digests: dict[str, list[str]], unfinished: str = "") -> None:
+    """Write the manifest of a folder: the digests of each file that is this package's.
+
+    ``unfinished`` is in the names of temporary files, as long as there may be some.
+    """
     partial = _new_file(folder / MANIFEST)
+    content = {"format": FORMAT, "kind": kind, "files": digests} | ({"unfinished": unfinished} if unfinished else {})
     try:
-        partial.write_text(json.dumps({"format": FORMAT, "kind": kind, "files": digests}, indent=1) + "\n", "utf-8")
+        partial.write_text(json.dumps(content, indent=1) + "\n", "utf-8")
         partial.replace(folder / MANIFEST)
     except BaseException:
         partial.unlink(missing_ok=True)
