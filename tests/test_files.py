@@ -241,6 +241,27 @@ def test_a_file_with_the_name_of_the_lock_stays_where_nothing_is_written_or_a_ru
     assert (tmp_path / ".lock").exists() == bool(content)
 
 
+def test_a_lock_whose_file_is_removed_by_the_command_that_had_it_is_none(tmp_path, monkeypatch):
+    def replace_and_lock(_descriptor: int) -> None:
+        (tmp_path / ".lock").unlink()
+        (tmp_path / ".lock").touch()
+
+    monkeypatch.setattr(sys.modules[result_folder.__module__], "_lock", replace_and_lock)
+    with pytest.raises(EvaluationError, match="another command"), result_folder(tmp_path, KIND):
+        pass
+
+
+def test_what_is_behind_a_linked_folder_is_not_removed_even_if_it_is_as_we_wrote_it(tmp_path):
+    folder, mine = tmp_path / "out", tmp_path / "mine"
+    write(folder, {"a.json": "1", "runs/x/b.json": "1"})
+    (folder / "runs").rename(mine)
+    (folder / "runs").symlink_to(mine)
+    write(folder, {"a.json": "2"})
+    remove_written(folder)
+    assert (mine / "x" / "b.json").read_text() == "1"
+    assert (folder / "runs").is_symlink()
+
+
 def test_a_lock_that_is_a_link_or_a_folder_is_refused(tmp_path):
     (tmp_path / "mine").write_text("mine")
     for folder, make in (

@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from sonar_graph.diagnosis import Finding
     from sonar_graph.logs import LogSummary
 
+MOST_TOPICS = 500
+"""Rows of the table for people; a log may have tens of thousands."""
+
 
 @with_options("salvage")
 def inspect(
@@ -85,7 +88,8 @@ def print_summary(summary: LogSummary, findings: list[Finding], skipped: str, la
     for heading in ("messages", "rate (Hz)", "span (s)", "max gap (s)", "jitter (ms)", "recorded after (s)"):
         topics.add_column(heading, justify="right")
     origin_ns = min((topic.first_stamp_ns for topic in summary.topics), default=0)
-    for topic in summary.topics:
+    shown = summary.topics[:MOST_TOPICS]
+    for topic in shown:
         kind = topic.type_name + (f" ({topic.encoding})" if topic.encoding != "cdr" else "")
         first_s, last_s = ((stamp_ns - origin_ns) * 1e-9 for stamp_ns in (topic.first_stamp_ns, topic.last_stamp_ns))
         cells = [topic.name, kind, str(topic.messages), f"{topic.rate_hz:.2f}", f"{first_s:.1f} to {last_s:.1f}"]
@@ -95,6 +99,8 @@ def print_summary(summary: LogSummary, findings: list[Finding], skipped: str, la
     for role in summary.roles:
         roles.add_row(escape(role.role.replace("_", " ")), escape(role.topic or "-"), escape(role.reason))
     console.print(topics, "", roles, "", sep="\n")
+    if len(summary.topics) > len(shown):
+        say("not shown", f"{len(summary.topics) - len(shown)} more topics; --json gives all")
     say("calibration", summary.calibration)
     for subject, note in summary.notes.items():
         say(subject, note)
@@ -111,7 +117,7 @@ def print_summary(summary: LogSummary, findings: list[Finding], skipped: str, la
         say("large", large, "bold yellow")
     for rows in summary.left_out:
         say("left out", rows)
-    for topic in summary.topics:
+    for topic in shown:
         if topic.refusal:
             say("not read", f"{topic.name} {topic.refusal}", "bold yellow")
         for fault in topic.stamp_faults:

@@ -154,7 +154,6 @@ def serve(handle: Callable[[Any, Tell], object]) -> NoReturn:
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     faulthandler.enable()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # who started it ends it
     requests: SimpleQueue[Any] = SimpleQueue()
 
     def listen() -> None:

@@ -96,6 +96,15 @@ def test_inspect_and_compare_say_what_a_large_log_takes(run, basin, tmp_path, mo
     assert re.search(r"^A large log, for each estimator: \d+ IMU rows, ", told.err)
 
 
+def test_of_very_many_topics_the_first_are_shown_and_the_others_counted(run, basin, monkeypatch, capsys):
+    monkeypatch.setattr("sonar_graph.cli.inspect_log.MOST_TOPICS", 2)
+    assert run("inspect", basin, "--quick") == 0
+    shown, hidden = re.search(r"(?s)(.*?)not shown (\d+) more topics", capsys.readouterr().out).groups()
+    topics = {topic["name"] for topic in answer(basin, "--quick")["topics"]}
+    assert len(topics) == 2 + int(hidden)
+    assert sum(f"\n{name} " in shown for name in topics) == 2
+
+
 def test_converted_data_set_can_be_inspected(run, tmp_path, capsys):
     log = tmp_path / "victoria_park.mcap"
     assert run("convert", "victoria-park", "-o", log) == 0

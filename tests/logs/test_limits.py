@@ -17,6 +17,7 @@ import zstandard
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import CalibrationError, LogError
 from sonar_graph.files import text_of
+from sonar_graph.files.inputs import LARGEST_TEXT
 from sonar_graph.logs.cdr import parse_definition
 from sonar_graph.logs.inspection import inspect_log
 from sonar_graph.logs.mcap import Keep, chunks, reader, records
@@ -83,8 +84,8 @@ def test_a_pipe_or_device_is_refused_wherever_a_file_is_read(tmp_path: Path, kin
 def test_a_text_that_is_too_large_is_refused_unread(tmp_path: Path) -> None:
     path = tmp_path / "a.toml"
     path.touch()
-    os.truncate(path, 1 << 40)  # without a block on the disk
-    with pytest.raises(OSError, match=f"it has {1 << 40} bytes, and at most"):
+    os.truncate(path, LARGEST_TEXT + 1)  # without a block on the disk
+    with pytest.raises(OSError, match=f"it has {LARGEST_TEXT + 1} bytes, and at most"):
         text_of(path)
 
 
