@@ -195,7 +195,8 @@ def read_batch(folder: Path, reference: str | None = None) -> RecordedBatch:
     except ModuleNotFoundError as error:
         raise EvaluationError(f"{path}: reading it needs pyarrow; pip install 'sonar-graph[bench]'") from error
     try:
-        table = pq.read_table(path)
+        with path.open("rb") as stream:  # pyarrow takes names of files in UTF-8 alone
+            table = pq.read_table(stream)
     except (pa.ArrowInvalid, OSError) as error:
         raise EvaluationError(f"{path}: cannot be read as Parquet ({error}); run bench again, it resumes") from error
     if absent := [name for name in NEEDED if name not in table.column_names]:

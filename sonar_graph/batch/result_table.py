@@ -167,6 +167,6 @@ def write_results(store: Store, suite: Suite, runs: list[PlannedRun]) -> Path:
         metadata={SUITE_METADATA: json.dumps(about).encode()},
     )
     path = store.folder / RESULTS
-    with replacing(path) as partial:
-        pq.write_table(pa.Table.from_pylist(rows, schema=schema), partial)
+    with replacing(path) as partial, partial.open("wb") as stream:  # pyarrow takes names of files in UTF-8 alone
+        pq.write_table(pa.Table.from_pylist(rows, schema=schema), stream)
     return path

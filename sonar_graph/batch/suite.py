@@ -32,7 +32,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
-from pydantic import BeforeValidator, Field, ValidationError, field_validator, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, field_validator, model_validator
 
 from sonar_graph.calibration import Section
 from sonar_graph.errors import BatchError
@@ -66,10 +66,19 @@ Grid = Annotated[
 """Values by name; names of nested settings are dotted."""
 
 
+def _printable(name: str) -> str:
+    if not name.isprintable():
+        raise ValueError("expected a name without control characters")
+    return name
+
+
+Name = Annotated[str, AfterValidator(_printable)]
+
+
 class LogEntry(Section):
     """One log, data set or generator; with a grid, several of them."""
 
-    name: str = Field(min_length=1)
+    name: Name = Field(min_length=1)
     """Label in tables."""
     log: str | None = None
     """MCAP file, relative to the suite's folder; its ``options``: `sonar_graph.batch.sources.LogOptions`."""
@@ -125,7 +134,7 @@ class EstimatorEntry(Section):
 
     name: str
     """Name of the installed estimator."""
-    variant: str = ""
+    variant: Name = ""
     """Label of these settings in tables."""
     params: dict[str, Any] = Field(default_factory=dict)
     """Settings that differ from the defaults."""
@@ -136,7 +145,7 @@ class EstimatorEntry(Section):
 class Suite(Section):
     """Content of a suite's file."""
 
-    name: str = Field(min_length=1)
+    name: Name = Field(min_length=1)
     description: str = ""
     rate_hz: float = Field(2.0, gt=0, le=1000)
     """Rate at which every estimator is asked for its estimate."""

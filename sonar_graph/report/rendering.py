@@ -14,7 +14,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 from markupsafe import Markup
 
 from sonar_graph.evaluation import Table, as_html
-from sonar_graph.files import replacing
+from sonar_graph.files import replacing, spelt
 
 FOLDER = "tables"
 LATEX_SPECIAL = {
@@ -54,7 +54,7 @@ def render(template: str, content: dict[str, Any]) -> str:
     )
     environment.filters |= {"svg": Markup, "csv": as_csv, "latex": as_latex, "address": data_address}
     environment.filters["html"] = lambda table, is_sortable: Markup(as_html(table, is_sortable=is_sortable))
-    return environment.get_template(template).render(**content)
+    return spelt(environment.get_template(template).render(**content))
 
 
 def data_address(text: str | bytes, kind: str) -> str:

@@ -51,6 +51,12 @@ def second(entry: str) -> str:
     [
         (head("nmae = 1\n"), "nmae", "nmae: there is no such field; did you mean name?"),
         (HEADER.replace('"short"', "3") + BASIN + DEAD_RECKONING, "name", "name: expected a text"),
+        (
+            HEADER.replace('"short"', '"a\\u001b[2J"') + BASIN + DEAD_RECKONING,
+            "name",
+            "expected a name without control",
+        ),
+        (end('variant = "a\\u202eb"\n'), "variant", "expected a name without control characters"),
         (end("grdi = {}\n"), "grdi", "did you mean grid?"),
         (log("seeds = -1.5\n"), "seeds", "seeds"),
         (log('log = "x.mcap"\n'), "[[logs]]", "exactly one of log, dataset and generator"),

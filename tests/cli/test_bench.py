@@ -13,6 +13,7 @@ import pytest
 
 import sonar_graph
 from sonar_graph.batch.gate import GateVerdict
+from sonar_graph.cli.arguments import printable
 from sonar_graph.cli.bench import verdict_lines
 
 ESTIMATOR = """
@@ -76,15 +77,16 @@ def batch(folder: Path, factor: float = 1.0, seeds: int = 8, not_run: int = 0) -
     for row in rows[len(rows) - not_run :]:
         row |= {"status": "not run", "causal.ate_se2_m": None}
     folder.mkdir()
-    pq.write_table(pa.Table.from_pylist(rows), folder / "results.parquet")
+    with (folder / "results.parquet").open("wb") as stream:
+        pq.write_table(pa.Table.from_pylist(rows), stream)
     return folder
 
 
 def test_report_rebuilds_page_and_tables_of_a_batch_and_warns_of_an_incomplete_one(run, tmp_path, capsys):
-    for folder, warned in ((batch(tmp_path / "whole"), ""), (batch(tmp_path / "part", not_run=3), "3 of 16 runs")):
+    for folder, warned in ((batch(tmp_path / "\udcff"), ""), (batch(tmp_path / "part", not_run=3), "3 of 16 runs")):
         assert run("report", folder) == 0
         said = capsys.readouterr()
-        assert said.out == f"Report: {folder / 'report.html'}\n"
+        assert said.out == f"Report: {printable(str(folder / 'report.html'))}\n"
         assert (folder / "tables" / "difference-ate-se2-m.tex").is_file()
         assert warned in (folder / "report.html").read_text("utf-8")
     assert "Warning: This batch is not complete: 3 of 16 runs have not been done (dead-reckoning 1 of 8" in said.err
