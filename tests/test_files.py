@@ -251,13 +251,13 @@ def test_a_lock_whose_file_is_removed_by_the_command_that_had_it_is_none(tmp_pat
         pass
 
 
-def test_what_is_behind_a_linked_folder_is_not_removed_even_if_it_is_as_we_wrote_it(tmp_path):
+@pytest.mark.parametrize("act", [lambda folder: write(folder, {"a.json": "2"}), remove_written])
+def test_what_is_behind_a_linked_folder_is_not_removed_even_if_it_is_as_we_wrote_it(tmp_path, act):
     folder, mine = tmp_path / "out", tmp_path / "mine"
     write(folder, {"a.json": "1", "runs/x/b.json": "1"})
     (folder / "runs").rename(mine)
     (folder / "runs").symlink_to(mine)
-    write(folder, {"a.json": "2"})
-    remove_written(folder)
+    act(folder)
     assert (mine / "x" / "b.json").read_text() == "1"
     assert (folder / "runs").is_symlink()
 

@@ -50,6 +50,8 @@ def test_instants_are_equally_spaced_inside_the_sequence(rate_hz):
 
 
 def test_sequence_shorter_than_a_step_is_refused():
+    with pytest.raises(MeasurementError, match=r"are \d+ instants, and at most 10000000 .*--start and --end"):
+        recording().instants(1e8)
     with pytest.raises(MeasurementError, match=r"too short for 0\.05 Hz"):
         recording().instants(0.05)
 

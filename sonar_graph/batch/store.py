@@ -132,7 +132,7 @@ class Store:
     def remove_partial(self) -> None:
         """Remove what a killed batch left half written or half removed; nothing else may be writing."""
         for path in (self.folder / RUNS).glob(f"{_PARTIAL}*"):
-            if _PARTIAL_NAME.fullmatch(path.name) and path.is_dir() and not path.is_symlink() and not others_in(path):
+            if _PARTIAL_NAME.fullmatch(path.name) and path.is_dir() and not path.is_symlink():
                 remove_written(path)
 
     def row(self, key: str) -> Row | None:

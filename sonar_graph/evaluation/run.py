@@ -332,7 +332,6 @@ class _Replay:
             self._process(estimator, progress)
             return self._finish(estimator, memory)
         except (Exception, SystemExit) as error:  # an estimator may fail in any way, and the others still run
-            self._check_interrupt()
             LOG.info("%s failed %s", self._name, self._stage, exc_info=True)
             told: dict[str, Any] = {}  # rows refused before are often why it failed
             if estimator is not None:

@@ -46,6 +46,11 @@ def test_only_large_logs_are_said_to_take_long():
         "for each estimator: 1000 landmark identities in 10000 detections, at least 0.1 GB and 2 min where an "
         "estimator keeps their joint covariance"
     )
+    kept = {name: np.resize(getattr(many, name), (200_000, *getattr(many, name).shape[1:])) for name in vars(many)}
+    kept |= {"stamps_ns": np.arange(200_000), "candidate_ids": np.tile([1, -1], (200_000, 1))}
+    assert expense(replace(small, detections=LandmarkDetections(**kept))) == (
+        "for each estimator: 200000 detections, at least 4 min where an estimator keeps and solves for all of them"
+    )
     rows = Imu(np.arange(2_000_000), *(np.zeros((2_000_000, 3)),) * 2)
     assert expense(replace(small, imu=rows)) == "for each estimator: 2000000 IMU rows, about 1 min"
 

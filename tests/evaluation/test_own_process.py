@@ -1,8 +1,11 @@
 """Estimators of other packages run in processes of their own, and what they do stays there."""
 
+import contextlib
 import os
 import re
+import signal
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -160,6 +163,20 @@ def test_processes_that_an_estimator_leaves_behind_end_with_its_own(plugin, miss
     assert run_estimator(mission, "their-leaving").status == "ok"
     child = int((tmp_path / "child").read_text())
     assert not psutil.pid_exists(child) or psutil.Process(child).status() == psutil.STATUS_ZOMBIE
+
+
+@pytest.mark.parametrize("failure", [RuntimeError, None])
+def test_an_interrupt_that_compiled_code_swallows_is_no_failure_of_the_estimator(mission, monkeypatch, failure):
+    def swallow(*_: object) -> None:
+        with contextlib.suppress(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(1)
+        if failure:
+            raise failure("from compiled code")
+
+    monkeypatch.setattr("baselines.dead_reckoning.DeadReckoning.process", swallow)
+    with pytest.raises(KeyboardInterrupt):
+        compare(mission, ["dead-reckoning"])
 
 
 def test_sys_exit_while_it_is_loaded_is_told_as_such(plugin, mission, monkeypatch):

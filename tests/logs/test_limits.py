@@ -60,6 +60,14 @@ def test_a_chunk_of_more_than_the_limit_is_lost_with_limit_and_remedy_before_it_
         assert "is lost" in loss.reason
 
 
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+def test_a_chunk_that_is_cut_off_is_unpacked_no_further_than_its_stated_size_and_a_piece(compression: str) -> None:
+    size = 1 << 28
+    packed = PACK[compression](bytes(size))
+    chunk = records.ChunkRecord(6, 0, 0, 0, 0, 1000, 0, compression, 0, len(packed))
+    assert len(chunks.unpack_beginning(chunk, packed[:-1])) < size / 4
+
+
 def test_messages_far_larger_than_their_file_are_refused(tmp_path: Path, monkeypatch: Any, make_sequence: Any) -> None:
     write_recording(tmp_path / "log.mcap", [imu_messages("/imu", make_sequence().imu)], {})
     size = (tmp_path / "log.mcap").stat().st_size

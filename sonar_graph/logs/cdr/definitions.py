@@ -269,8 +269,6 @@ class _Parser:
             if match["name"] in fields:
                 raise LogError(f"the definition of {name} has two fields called {match['name']}")
             fields[match["name"]] = Field(match["name"], kind, length, is_array=match["array"] is not None)
-            if len(fields) > _MOST_FIELDS:
-                break
         struct = self._done[name] = Struct(name, tuple(fields.values()))
         self._sizes[name] = sum(
             self._sizes[entry.kind.name] if isinstance(entry.kind, Struct) else 1 for entry in struct.fields
