@@ -19,7 +19,8 @@ Of each log one line of JSON:
 
 and ``real_time_ratio``, processor time of all calls over the length of the log.
 
-The last line has the worst of all logs.
+The last line has the worst of the recordings, and the ``real_time_ratio`` of all. The survey's times are stated; its
+one limit is that it keeps up with its 2 Hz.
 """
 
 import gc
@@ -180,10 +181,14 @@ def main() -> None:
     gc.freeze()
     found = []
     for sequence in logs(arguments.data, is_quick=arguments.quick):
-        if arguments.only in sequence.name:
+        if arguments.only.lower() in sequence.name.lower():
             found.append(run(sequence, 120.0 if arguments.quick else None))
             print_figures(found[-1])
-    figures: dict[str, Any] = {name: max(each[name] for each in found) for name in TARGETS}
+    if not found:
+        sys.exit(f"--only {arguments.only}: no log has that in its name; expected a part of one, as in the docstring")
+    recorded = [each for each in found if not each["log"].startswith("survey")] or found
+    figures: dict[str, Any] = {name: max(each[name] for each in recorded) for name in TARGETS}
+    figures["real_time_ratio"] = max(each["real_time_ratio"] for each in found)
     for name, limit in TARGETS.items():
         print(f"{name}: {figures[name]:.3f}, target at most {limit:g}")
     figures["passed"] = all(figures[name] <= limit for name, limit in TARGETS.items())

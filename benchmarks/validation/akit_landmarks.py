@@ -108,10 +108,11 @@ def _sightings(placed: Sequence) -> tuple[float, float]:
 def reference_wander(folder: Path, number: int, positions: Floats) -> tuple[float, float]:
     """Difference of the reference's positions from the sum of its velocities: rms over one second, and maximum.
 
-    Horizontal, metres. Velocities are integrated along cubic splines, row by row.
+    Horizontal, metres. Velocities are integrated along cubic splines, row by row. The sequence may lack the first
+    rows of the file, those before its IMU began.
     """
     path = folder / f"Trajectory{number}" / f"GT_trajectory{number}.csv"
-    north, east = read_table(path, REFERENCE_COLUMNS, delimiter=",", header_lines=1).values[:, 4:6].T
+    north, east = read_table(path, REFERENCE_COLUMNS, delimiter=",", header_lines=1).values[-len(positions) :, 4:6].T
     seconds = np.arange(len(positions), dtype=float)
     summed = CubicSpline(seconds, np.column_stack([east, north])).antiderivative()(seconds)
     wander = positions[:, :2] - summed
