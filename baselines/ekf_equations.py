@@ -152,7 +152,7 @@ def observe(
             U_v = Vec6(U_X, Vec3(U[b, 3], U[b, 4], U[b, 5]))
             S[a, b] = R_z[a, b] + (H_v[a] @ U_v + H_b[a] @ (mat6(C) @ H_b[b]))
     S[1, 0] = S[0, 1]
-    outcome, widened = admit(e, S, R_z, gate)
+    outcome, widened = admit(e, S, R_z, gate, at)
     if outcome != GATED:
         correct(x, P, U, S + widened, e)
     return outcome
@@ -189,7 +189,7 @@ def observe_far(
     H = np.zeros((LANDMARK, len(x)))
     H[:, :POSE], H[:, at : at + LANDMARK] = -G_v, np.eye(3)
     U, missed = H @ P, seen - x[at : at + LANDMARK]
-    view = far_view(missed, U @ H.T + G_b @ motion.C @ G_b.T, G_z, sonar, z, R_z)
+    view = far_view(missed, U @ H.T + G_b @ motion.C @ G_b.T, G_z, sonar, z, R_z, at)
     if view is None:
         return None
     outcome, cov, e, S = view

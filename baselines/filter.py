@@ -227,9 +227,9 @@ class FilterShell(ABC):
         if not let_in:
             return []
         return [
-            f"most of {JUDGED_TOGETHER} detections in a row were outliers, first at {let_in[0]} ns, so {len(let_in)}"
-            " were used outside the gate: the filter was wrong, not they, and the gate may be the cause; give"
-            " gate_probability = 1, or larger noise"
+            f"most of {JUDGED_TOGETHER} detections in a row, of landmarks that had agreed, were outliers, first at"
+            f" {let_in[0]} ns, so {len(let_in)} were used outside the gate: the filter was wrong, not they, and the"
+            " gate may be the cause; give gate_probability = 1, or larger noise"
         ]
 
     def refused_rows(self) -> list[RefusedRow]:

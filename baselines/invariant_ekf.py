@@ -153,7 +153,7 @@ class InvariantEkf(FilterShell):
             missed, H = x - state.points[k], -G
             H[:, equations.place_of(k)] += EYE
             HP, S = equations.innovation_covariance(state, H, G_m @ motion.C @ G_m.T)
-            view = far_view(missed, S, G_z, self.sonar, z, R_z)
+            view = far_view(missed, S, G_z, self.sonar, z, R_z, slot)
             if view is not None:
                 outcome, S, e, S_view = view
                 if outcome != GATED:
@@ -163,7 +163,7 @@ class InvariantEkf(FilterShell):
         e = z - predicted
         e[1] = wrap_angle(e[1])
         HP, S = equations.innovation_covariance(state, H, H_m @ motion.C @ H_m.T + R_z)
-        outcome, widened = admit(e, S, R_z, self.sonar.gate)
+        outcome, widened = admit(e, S, R_z, self.sonar.gate, slot)
         if outcome != GATED:
             equations.correct(state, HP, S + widened, e)
         return outcome, e, S

@@ -21,6 +21,7 @@ USED, GATED, NEW, LET_IN = (OUTCOME_NUMBERS[o] for o in (Outcome.USED, Outcome.G
 OUTLYING, JUDGED_TOGETHER = -2.0 * math.log(0.001), 10
 """Squared Mahalanobis distance that one right detection in a thousand exceeds, and number of detections of which most
 tell: with a tenth of outliers six of ten are so once in 7,000 times, ``P(Bin(10, 0.1) > 5) = 1.5e-4``."""
+MOST_LANDMARKS = 1 << 16
 
 
 @compiled
@@ -61,29 +62,36 @@ class Gate(NamedTuple):
     """Of the kernel, in standard deviations; infinite: none."""
     outlying: NDArray[np.bool_]
     """Which of the last detections were outliers, as a ring."""
+    has_agreed: NDArray[np.bool_]
+    """Landmarks of which a detection was no outlier, by place in the state, modulo its length."""
     judged: Ints
-    """Number of detections so far, shape (1,)."""
+    """Number of their detections so far, shape (1,)."""
 
     @classmethod
     def of(cls, gate_probability: float, kernel_width: float) -> "Gate":
         """The gate and kernel of a filter's settings (`FilterParams`), with nothing judged yet."""
         threshold, width = gate_threshold(gate_probability, 2), kernel_width or math.inf
-        return cls(threshold, width, np.zeros(JUDGED_TOGETHER, np.bool_), np.zeros(1, np.int64))
+        outlying, has_agreed = np.zeros(JUDGED_TOGETHER, np.bool_), np.zeros(MOST_LANDMARKS, np.bool_)
+        return cls(threshold, width, outlying, has_agreed, np.zeros(1, np.int64))
 
 
 @compiled
-def admit(e: Floats, S: Floats, R_z: Floats, gate: Gate) -> tuple[int, Floats]:
+def admit(e: Floats, S: Floats, R_z: Floats, gate: Gate, landmark: int) -> tuple[int, Floats]:
     """Judge an innovation of range and azimuth: `USED`, `GATED` or `LET_IN`, and what the kernel adds to R_z (2, 2).
 
     The kernel's weights w_i at ``e_i / sqrt(S_ii)`` make ``R_ij / sqrt(w_i w_j)`` of the noise. While most of the last
-    detections are outliers, the filter is wrong, not they: no gate, no kernel. docs/theory/fair_comparison.md.
+    detections of landmarks that have agreed before are outliers, the filter is wrong, not they: no gate, no kernel. One
+    that never agreed may have begun by a wrong name. docs/theory/fair_comparison.md.
     """
     squared = S[1, 1] * e[0] ** 2 - 2.0 * S[0, 1] * e[0] * e[1] + S[0, 0] * e[1] ** 2
     squared /= S[0, 0] * S[1, 1] - S[0, 1] ** 2
     widened, is_inside = np.zeros((2, 2)), squared <= gate.threshold
-    gate.outlying[gate.judged[0] % len(gate.outlying)] = not squared <= OUTLYING
-    gate.judged[0] += 1
-    if 2 * gate.outlying.sum() > len(gate.outlying):
+    is_outlier, landmark = not squared <= OUTLYING, landmark % MOST_LANDMARKS
+    if gate.has_agreed[landmark]:
+        gate.outlying[gate.judged[0] % JUDGED_TOGETHER] = is_outlier
+        gate.judged[0] += 1
+    gate.has_agreed[landmark] |= not is_outlier
+    if 2 * gate.outlying.sum() > JUDGED_TOGETHER:
         return USED if is_inside else LET_IN, widened
     if not is_inside:
         return GATED, widened
@@ -152,7 +160,7 @@ def polar_covariance(R_z: Floats, aperture_rad: float) -> Floats:
 
 
 def far_view(
-    missed: Floats, cov: Floats, G_z: Floats, sonar: SonarModel, z: Floats, R_z: Floats
+    missed: Floats, cov: Floats, G_z: Floats, sonar: SonarModel, z: Floats, R_z: Floats, landmark: int
 ) -> tuple[int, Floats, Floats, Floats] | None:
     """Compare a landmark with the point seen, which is linear in both positions; None where `observe` is linear enough.
 
@@ -183,5 +191,5 @@ def far_view(
     cov = 0.5 * (cov + cov.T)
     B = np.array([along, across / r**2])  # range and azimuth by the point
     e, S = B @ missed, B @ cov @ B.T
-    outcome, widened = admit(e, S, R_z, sonar.gate)
+    outcome, widened = admit(e, S, R_z, sonar.gate, landmark)
     return outcome, cov + G_z[:, :2] @ widened @ G_z[:, :2].T, e, S

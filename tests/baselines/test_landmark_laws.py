@@ -249,7 +249,7 @@ def test_what_no_vehicle_in_reach_sees_is_refused(filter_):
 def far(cov, G_z, range_m, noise, missed=(0.0, 0.0, 0.0), aperture_rad=APERTURE_RAD, kernel_width=0.0):
     """`far_view` of a detection with this covariance of range and azimuth; None where it is linear enough."""
     sonar = SonarModel.of(AHEAD, Gate.of(1.0, kernel_width))._replace(aperture_rad=aperture_rad)
-    return far_view(np.array(missed), np.array(cov), G_z, sonar, np.array([range_m, 0.0]), np.array(noise))
+    return far_view(np.array(missed), np.array(cov), G_z, sonar, np.array([range_m, 0.0]), np.array(noise), 0)
 
 
 def test_the_noise_of_a_view_holds_that_of_many_beams_and_without_aperture_is_the_detection_s():
@@ -313,7 +313,7 @@ def test_the_gate_is_an_ellipse_of_a_correlated_innovation(direction):
 
 def admitted(e, S, R_z=NOISE, *, gate_probability=1.0, kernel_width=0.0):
     """Judgement of the first detection by these settings."""
-    return admit(np.array(e), np.array(S), R_z, Gate.of(gate_probability, kernel_width))
+    return admit(np.array(e), np.array(S), R_z, Gate.of(gate_probability, kernel_width), 0)
 
 
 def test_a_kernel_weighs_range_and_azimuth_each_as_in_the_graph():
@@ -344,8 +344,8 @@ def test_a_gate_refuses_a_few_outliers_and_opens_when_most_are():
     """Of the last ten; it closes again when most are not. One in a thousand right ones is an outlier."""
     gate, S = Gate.of(0.99, 0.0), np.eye(2)
 
-    def judge(squared, times=1):
-        return [admit(np.array([math.sqrt(squared), 0.0]), S, NOISE, gate) for _ in range(times)]
+    def judge(squared, times=1, landmark=3):
+        return [admit(np.array([math.sqrt(squared), 0.0]), S, NOISE, gate, landmark) for _ in range(times)]
 
     assert JUDGED_TOGETHER == 10
     assert pytest.approx(chi2.ppf(0.999, 2)) == OUTLYING
@@ -354,8 +354,11 @@ def test_a_gate_refuses_a_few_outliers_and_opens_when_most_are():
     assert not np.any([widened for outcome, widened in told if outcome == LET_IN])
     assert [outcome for outcome, _ in judge(1.0, 5) + judge(100.0)] == [USED] * 5 + [GATED]
     always = Gate.of(0.99, 0.0)  # outside the gate, but no outliers
-    told = [admit(np.array([math.sqrt(OUTLYING - 0.1), 0.0]), S, NOISE, always)[0] for _ in range(20)]
+    told = [admit(np.array([math.sqrt(OUTLYING - 0.1), 0.0]), S, NOISE, always, 0)[0] for _ in range(20)]
     assert told == [GATED] * 20
+    judge(1.0, 10)
+    assert [outcome for outcome, _ in judge(100.0, 20, landmark=7)] == [GATED] * 20  # begun by a wrong name
+    assert [outcome for outcome, _ in judge(1.0, 1, landmark=7) + judge(100.0, 6, landmark=7)][-1] == LET_IN
 
 
 BEFORE_S, LOST_S, AFTER_S = 25.0, 120.0, np.array([3.0, 10.0, 20.0])

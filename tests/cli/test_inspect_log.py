@@ -91,7 +91,9 @@ def test_inspect_and_compare_say_what_a_large_log_takes(run, basin, tmp_path, mo
     assert run("inspect", basin) == run(*words) == 0
     told = capsys.readouterr()
     assert re.search(
-        r"^large for each estimator: \d+ IMU rows, about 0 min; 4 landmark identities", told.out, re.MULTILINE
+        r"^large for each estimator: \d+ IMU rows, about 0 min; \d+ detections, .*; 4 landmark identities",
+        told.out,
+        re.MULTILINE,
     )
     assert re.search(r"^A large log, for each estimator: \d+ IMU rows, ", told.err)
 
