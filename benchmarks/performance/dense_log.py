@@ -13,7 +13,8 @@ Of each log one line of JSON:
   what is there after it is frozen (`gc.freeze`), as a live program should: else Python's collector walks over all
   modules in some updates;
 * ``finish_s``: the batch solution at the end with all landmarks' covariances, processor time;
-* ``landmark_gap_m``: largest distance of a landmark between the live estimate and that solution;
+* ``landmark_gap_m``: largest horizontal distance of a landmark between the live estimate and that solution (above or
+  below the plane of a planar robot is the same to its sonar);
 * ``sigma_ratio``: largest ratio, or its inverse, of live standard deviations to those of ``gtsam.Marginals`` at the
   batch solution: the newest keyframe's horizontal position and yaw, and the landmarks' horizontal position;
 
@@ -130,7 +131,7 @@ def run(sequence: Sequence, until_s: float | None = None) -> dict[str, Any]:
     start = time.thread_time()
     batch = estimator.landmarks()
     finish_s = time.thread_time() - start
-    gaps_m = [np.linalg.norm(live.atPoint3(L(i)) - p) for i, p in zip(batch.ids, batch.positions, strict=True)]
+    gaps_m = [np.linalg.norm((live.atPoint3(L(i)) - p)[:2]) for i, p in zip(batch.ids, batch.positions, strict=True)]
     ratios = [sigmas(estimator, "window", keyframe=newest) / sigmas(estimator, "history", keyframe=newest)]
     for i, exact in zip(batch.ids.tolist(), batch.covariances, strict=True):
         ratios.append(sigmas(estimator, "window", landmark=i) / np.sqrt(np.diag(exact)[:2]))

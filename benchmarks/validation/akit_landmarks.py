@@ -14,12 +14,14 @@ Part of `akit`. Three things decide what is seen, and each is made visible:
   while they are in sight and leave the drift between. Seen up to 150 m away they are seen again and again.
 """
 
+import math
 from dataclasses import dataclass, replace
 from math import radians
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from common import note
 from scipy.interpolate import CubicSpline
 
 from sonar_graph.evaluation import judge, run_estimator
@@ -78,7 +80,7 @@ def slam(aligned: Sequence, seed: int) -> dict[str, Scores]:
 
 
 def _scores(aligned: Sequence, placing: Placing, start: Any) -> Scores:
-    """Each estimator's, asked at the reference's own instants: nothing is interpolated."""
+    """Each estimator's, asked at the reference's own instants: nothing is interpolated. NaN of one that failed."""
     placed = add_landmarks(aligned, placing.options)
     changes: dict[str, Any] = {"start": start}
     if placing.sigma_m_s is not None:
@@ -93,11 +95,14 @@ def _scores(aligned: Sequence, placing: Placing, start: Any) -> Scores:
     ]
     for result in runs:
         if result.status == "failed":
-            raise RuntimeError(f"{aligned.name}: {result.estimator}: {result.reason}")
+            note(f"{aligned.name}: {result.estimator}: {result.reason}")
     scores = judge(sequence, stamps_ns, runs).scores
     return {
-        name: {f"{kind}.{measure}": own[f"{kind}.{measure}"].value for kind in KINDS for measure in MEASURES}
-        for name, own in scores.items()
+        result.estimator: {
+            name: math.nan if result.status == "failed" else scores[result.estimator][name].value
+            for name in (f"{kind}.{measure}" for kind in KINDS for measure in MEASURES)
+        }
+        for result in runs
     }
 
 

@@ -100,7 +100,15 @@ def slam_figures(numbers: tuple[int, ...], runs: list[Figures]) -> Figures:
     return {
         "reference_wander_m": [r["reference_wander_m"] for r in runs],
         "sightings": [r["sightings"] for r in runs],
-        "slam": [r["slam"] for r in runs],
+        "slam": [
+            {
+                placing: {
+                    name: {m: v if np.isfinite(v) else None for m, v in own.items()} for name, own in each.items()
+                }
+                for placing, each in r["slam"].items()
+            }
+            for r in runs
+        ],
         "landmarks_help": {
             f"{placing} {kind}": min(error_ratio(r["slam"][placing], kind) for r in sure)
             for placing in ("near", "far")
