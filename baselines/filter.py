@@ -228,8 +228,8 @@ class FilterShell(ABC):
             return []
         return [
             f"most of {JUDGED_TOGETHER} detections in a row, of landmarks that had agreed, were outliers, first at"
-            f" {let_in[0]} ns, so {len(let_in)} were used outside the gate: the filter was wrong, not they, and the"
-            " gate may be the cause; give gate_probability = 1, or larger noise"
+            f" {let_in[0] * 1e-9:.3f} s, so {len(let_in)} were used outside the gate: the filter was wrong, not they,"
+            " and the gate may be the cause; give gate_probability = 1, or larger noise"
         ]
 
     def refused_rows(self) -> list[RefusedRow]:

@@ -47,7 +47,7 @@ KINDS: tuple[Kind, Kind] = ("causal", "smoothed")
 FORMAT = "sonar_graph comparison 1"
 INDEX, SEQUENCE, RUNS = "comparison.json", "sequence.npz", "runs"
 RESULT, SERIES, RESULT_LOG = "result.json", "series.npz", "result.mcap"
-ENSEMBLES = "ensembles.json"
+ENSEMBLES, PAGE = "ensembles.json", "report.html"
 ESTIMATES = ("trajectory.tum", "causal.tum", "landmarks.csv")
 _SCORE, _TEXTS, _STATUS = TypeAdapter(Score), TypeAdapter(dict[str, str]), TypeAdapter(Literal["ok", "failed"])
 """Types of what people may have edited in ``comparison.json``."""
@@ -76,7 +76,7 @@ def write_comparison(comparison: Comparison, folder: Path) -> None:
         if name in ("", ".", "..") or any(character in name for character in '/\\:*?"<>|'):
             raise EvaluationError(f"estimator name {name!r} cannot name a folder; install it under another name")
     with result_written(folder, COMPARISON) as written:
-        written.remove([INDEX, ENSEMBLES, *(name for name in written.names if name.startswith(f"{RUNS}/"))])
+        written.remove([INDEX, ENSEMBLES, PAGE, *(name for name in written.names if name.startswith(f"{RUNS}/"))])
         _write(comparison, folder)
 
 

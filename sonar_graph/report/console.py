@@ -88,7 +88,8 @@ def _lines_below(comparison: Comparison, metric: str | None) -> list[str]:
         lines.append(sentences.no_detections(comparison))
     if metric is None:
         mapped = f"map: {LABELS['se2_m']}" if "landmarks.se2_m" in score_keys(comparison) else ""
-        return [*lines, *filter(None, [mapped]), "No position errors: the report says why."]
+        why = comparison.environment["scored instants"].removeprefix("none: ")
+        return [*lines, *filter(None, [mapped]), f"No position errors: {why}"]
     lines += [f"causal, smoothed: {LABELS[metric]}"]
     lines += [f"on own map: {LABELS['own_map_m']}"] if "causal.own_map_m" in score_keys(comparison) else []
     lines.append(NEES_LEGEND)

@@ -15,6 +15,7 @@ from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation.comparison import compare
 from sonar_graph.evaluation.results import Comparison
 from sonar_graph.evaluation.storage import read_comparison, write_comparison, write_viewer_files
+from sonar_graph.report import write_report
 
 from .conftest import Offset, straight_sequence
 
@@ -137,6 +138,15 @@ def test_nothing_of_an_earlier_comparison_remains(comparison, tmp_path):
     assert [path.name for path in (tmp_path / "runs" / "other").iterdir()] == ["my notes.txt"]
     assert (tmp_path / "runs" / "broken" / "trajectory.tum").exists()
     assert [run.estimator for run in read_comparison(tmp_path).runs] == ["offset", "broken"]
+
+
+def test_a_page_of_an_earlier_comparison_does_not_stay_beside_the_numbers_of_a_later_one(comparison, tmp_path):
+    write_report(comparison, tmp_path)
+    write_comparison(comparison, tmp_path)
+    assert not (tmp_path / "report.html").exists()
+    (tmp_path / "report.html").write_text("mine")
+    write_comparison(comparison, tmp_path)
+    assert (tmp_path / "report.html").read_text() == "mine"
 
 
 def test_an_interrupted_writing_leaves_the_earlier_comparison_as_it_was(comparison, monkeypatch, tmp_path):
