@@ -6,7 +6,9 @@ Linear algebra runs in one thread: matrices here are small, and the threads of s
 from __future__ import annotations
 
 import os
+import signal
 import tarfile
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,6 +24,8 @@ if TYPE_CHECKING:
 os.environ["MPLBACKEND"] = "Agg"
 for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):  # before numpy is loaded, here and in the workers
     os.environ.setdefault(name, "1")
+if threading.current_thread() is threading.main_thread():  # a shell's job in the background ignores interrupts
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 settings.register_profile("thorough", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.register_profile("fast", settings.get_profile("thorough"), max_examples=20)
