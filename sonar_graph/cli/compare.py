@@ -240,7 +240,7 @@ def compare_log(
     rate_hz: float,
 ) -> Comparison:
     """Read a log, recognise landmarks if it needs that, and compare estimators."""
-    from sonar_graph.diagnosis import wrong_units
+    from sonar_graph.diagnosis import doubts
     from sonar_graph.evaluation import compare as compare_runs
     from sonar_graph.evaluation import expense
     from sonar_graph.logs.adapters import LogConfig
@@ -249,9 +249,9 @@ def compare_log(
     with progress_bars() as progress:
         sequence = reading.read(log, progress=partial(progress, f"reading {log.name}"))
     check_rate(rate_hz, sequence)
-    if units := wrong_units(sequence, reading.config or LogConfig()):
-        said = "; ".join(f"{one.quantity}: {one.advice}" for one in units)
-        sequence = replace(sequence, notes={**sequence.notes, "log.units": said})
+    if doubted := doubts(sequence, reading.config or LogConfig()):
+        said = "; ".join(f"{one.quantity}: {one.text()}" for one in doubted)
+        sequence = replace(sequence, notes={**sequence.notes, "log.sensors": said})
     found = None
     if sequence.detections is None or recognition.is_given:
         found = recognise_log(log, sequence, reading, recognition.recogniser(sequence.calibration))

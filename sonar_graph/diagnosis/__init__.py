@@ -2,8 +2,8 @@
 
 # fmt: off
 from sonar_graph.diagnosis.findings import Finding
-from sonar_graph.diagnosis.sensor_check import check_sensors, wrong_units
+from sonar_graph.diagnosis.sensor_check import check_sensors, doubts
 
 __all__ = [
-    "Finding", "check_sensors", "wrong_units",
+    "Finding", "check_sensors", "doubts",
 ]

@@ -21,7 +21,7 @@ from sonar_graph.diagnosis.findings import (
     numbers,
 )
 from sonar_graph.logs.adapters import LogConfig
-from sonar_graph.measurements import NS_PER_S, Floats, Imu, Ints, PositionFixes
+from sonar_graph.measurements import NS_PER_S, Floats, Heading, Imu, Ints, PositionFixes
 from sonar_graph.navigation.alignment import Estimate1D
 from sonar_graph.sequence import Sequence
 
@@ -48,16 +48,14 @@ def turned_about_up(imu: Imu, body_R_imu: Floats, at_ns: Ints) -> Floats:
     return np.interp(at_ns, imu.stamps_ns, np.concatenate([[0.0], np.cumsum(steps)]))
 
 
-def heading_findings(right: Sequence, config: LogConfig) -> Iterator[Finding]:
-    """Sense in which the heading turns, by the gyros; then the angle by which it is off the world of the positions."""
-    if right.heading is None:
-        return
+def heading_sense(sequence: Sequence, heading: Heading, config: LogConfig) -> Finding:
+    """Sense in which the heading turns, by the gyros."""
     ends = np.arange(
-        max(right.start_ns, right.heading.stamps_ns[0]), min(right.end_ns, right.heading.stamps_ns[-1]) + 1, WINDOW_NS
+        max(sequence.start_ns, heading.stamps_ns[0]), min(sequence.end_ns, heading.stamps_ns[-1]) + 1, WINDOW_NS
     )
-    body_R_imu = right.calibration.imu.mounting.pose().rotation().matrix()
-    x = np.diff(turned_about_up(right.imu, body_R_imu, ends))
-    y = np.diff(np.interp(ends, right.heading.stamps_ns, np.unwrap(right.heading.yaw_rad)))
+    body_R_imu = sequence.calibration.imu.mounting.pose().rotation().matrix()
+    x = np.diff(turned_about_up(sequence.imu, body_R_imu, ends))
+    y = np.diff(np.interp(ends, heading.stamps_ns, np.unwrap(heading.yaw_rad)))
     sense = Estimate1D(np.nan, np.inf, "too little turning")
     if len(x) >= FEWEST_WINDOWS and np.ptp(x) > 0:
         x, y = x - float(x.mean()), y - float(y.mean())
@@ -67,15 +65,22 @@ def heading_findings(right: Sequence, config: LogConfig) -> Iterator[Finding]:
     if sense.is_known and matters(sense, 0.0) and sense.value < 0:
         world = "enu" if config.table("heading").get("world") == "ned" else "ned"
         advice = f'it turns against the gyros, clockwise: `world = "{world}"` under [heading] {IN_LOG_CONFIG}'
-        yield Finding("heading: turn over that of the gyros", sense, "", advice, acts=True)
-        return
+        return Finding("heading: turn over that of the gyros", sense, "", advice, acts=True)
     is_stuck = sense.is_known and sense.value + INTERVAL_SIGMAS * sense.sigma < 0.5
     advice = (
         "it hardly turns where the gyros do: stuck, or not of the body; `use = false` under [heading] " + IN_LOG_CONFIG
     )
-    yield Finding("heading: turn over that of the gyros", sense, "", advice if is_stuck else NO_NEED, is_stuck)
+    return Finding("heading: turn over that of the gyros", sense, "", advice if is_stuck else NO_NEED, is_stuck)
+
+
+def heading_findings(right: Sequence, config: LogConfig) -> Iterator[Finding]:
+    """Sense of the heading; where it turns as the gyros, the angle by which it is off the world of the positions."""
+    if right.heading is None:
+        return
+    sense = heading_sense(right, right.heading, config)
+    yield sense
     known = right.positions or right.truth
-    if known is None:
+    if sense.acts or known is None:
         return
     places = known.position_m if isinstance(known, PositionFixes) else known.positions
     yaw_rad = np.interp(right.dvl.stamps_ns, right.heading.stamps_ns, np.unwrap(right.heading.yaw_rad))

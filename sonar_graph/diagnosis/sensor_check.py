@@ -15,7 +15,7 @@ from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import DvlCalibration, Start
-from sonar_graph.diagnosis.aiding_check import heading_findings, position_findings
+from sonar_graph.diagnosis.aiding_check import heading_findings, heading_sense, position_findings
 from sonar_graph.diagnosis.findings import (
     IN_CALIBRATION,
     IN_LOG_CONFIG,
@@ -106,6 +106,18 @@ def wrong_units(sequence: Sequence, config: LogConfig) -> list[Finding]:
         )
     unknown = Estimate1D(np.nan, np.inf, "wrong unit")
     return [Finding(quantity, unknown, "", line, acts=True) for quantity, line in advice.items()]
+
+
+def doubts(sequence: Sequence, config: LogConfig) -> list[Finding]:
+    """Findings to act on that a run can tell at once: wrong units, else sense of a heading, unit and place of fixes.
+
+    What needs a Doppler log that is put right (`check_sensors`) is left to ``inspect``.
+    """
+    if faults := wrong_units(sequence, config):
+        return faults
+    heading = sequence.heading
+    senses = [] if heading is None else [heading_sense(sequence, heading, config)]
+    return [finding for finding in (*senses, *position_findings(sequence, config)) if finding.acts]
 
 
 def tilt_rates(imu: Imu) -> tuple[float, float] | None:

@@ -59,7 +59,7 @@ from sonar_graph.logs.vehicle_setup import (
 from sonar_graph.measurements import Block, Dvl, Imu
 from sonar_graph.sequence import Sequence
 
-FOUND_ANEW = frozenset({"log.warnings", "log.gaps", "log.noise", "log.units"})
+FOUND_ANEW = frozenset({"log.warnings", "log.gaps", "log.noise", "log.sensors"})
 """Notes about the rows of a log; those of an earlier reading may no longer hold."""
 
 NOISE_FIELDS = {

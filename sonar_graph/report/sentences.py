@@ -57,7 +57,7 @@ SAID_NOTES = {
     "log.dropped": "Log, left out",
     "log.warnings": WARNING,
     "log.gaps": WARNING,
-    "log.units": WARNING,
+    "log.sensors": WARNING,
 }
 """Notes that the terminal shows, and the word before each; the report has all notes."""
 

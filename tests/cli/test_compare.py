@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from sonar_graph.estimator import load_estimator
 from sonar_graph.evaluation.storage import read_comparison
 from sonar_graph.logs.reading import read_log
 from sonar_graph.logs.writing import write_log
-from sonar_graph.measurements import Dvl, Imu
+from sonar_graph.measurements import NS_PER_S, Dvl, Heading, Imu, PositionFixes
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.basin import FASTEST_M_S, PAPER_LAPS, BasinOptions, cruise_speed
 
@@ -109,15 +110,38 @@ def test_run_writes_one_estimator_with_the_calibration_given_before_that_of_the_
     assert said["notes"]["log.calibration"] == f"from {moved}: start.position_m; else from the log"
 
 
-def test_compare_names_a_wrong_unit_that_inspect_names_and_none_of_a_sound_log(run, basin, tmp_path, capsys):
-    sequence, log = read_log(basin), tmp_path / "degrees.mcap"
-    rate = np.degrees(sequence.imu.angular_velocity)
-    write_log(log, replace(sequence, imu=replace(sequence.imu, angular_velocity=rate)))
-    named = []
-    for which in (log, basin):
-        assert run("run", which, "--estimator", "dead-reckoning", "-o", tmp_path / "out") == 0
-        named.append("Warning: gyro: unit: rates look 57 times too large" in capsys.readouterr().out)
-    assert named == [True, False]
+def degrees(sequence: Sequence) -> Sequence:
+    return replace(sequence, imu=replace(sequence.imu, angular_velocity=np.degrees(sequence.imu.angular_velocity)))
+
+
+def aided(sequence: Sequence, sense: float = 1.0, unit: float = 1.0) -> Sequence:
+    """With a compass and position fixes of the truth."""
+    truth = sequence.truth.at(np.arange(sequence.start_ns, sequence.truth.stamps_ns[-1], NS_PER_S))
+    heading = Heading(truth.stamps_ns, sense * truth.rotations().as_euler("ZYX")[:, 0], np.full(len(truth), np.nan))
+    fixes = PositionFixes(truth.stamps_ns, unit * truth.positions, np.full((len(truth), 3, 3), np.nan))
+    return replace(sequence, heading=heading, positions=fixes)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "told"),
+    [
+        (degrees, "gyro: unit: rates look 57 times too large"),
+        (partial(aided, sense=-1.0), "heading: turn over that of the gyros: -1.00"),
+        (partial(aided, unit=1e3), "position fixes: unit: in 10 s they move by"),
+        (aided, None),
+    ],
+)
+def test_run_and_compare_name_what_sensors_contradict_and_nothing_of_a_sound_log(
+    run, basin, tmp_path, capsys, spoil, told
+):
+    log, out = tmp_path / "spoilt.mcap", tmp_path / "out"
+    write_log(log, spoil(read_log(basin)))
+    for command, option in (("run", "--estimator"), ("compare", "--estimators")):
+        assert run(command, log, option, "dead-reckoning", "-o", out) == 0
+        said = capsys.readouterr().out
+        assert f"Warning: {told}" in said if told else "heading: turn" not in said
+    page = (out / "report.html").read_text()
+    assert f"Warning: {told}" in page if told else "position fixes: " not in page
 
 
 def test_estimators_lists_every_setting(run, capsys):

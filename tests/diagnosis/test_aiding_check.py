@@ -46,7 +46,7 @@ def test_a_compass_that_turns_against_the_gyros_is_named_with_the_other_world(gy
     sense, _ = aiding_check.heading_findings(compass(run, lambda yaw_rad: yaw_rad + 0.01), NO_CONFIG)
     assert not sense.acts
     assert sense.estimate.value == pytest.approx(1.0, abs=0.1)
-    stuck, _ = aiding_check.heading_findings(compass(run, lambda yaw_rad: 0 * yaw_rad), NO_CONFIG)
+    (stuck,) = aiding_check.heading_findings(compass(run, lambda yaw_rad: 0 * yaw_rad), NO_CONFIG)
     assert stuck.acts
     assert "it hardly turns where the gyros do" in stuck.text()
 
