@@ -140,10 +140,10 @@ def render_report(comparison: Comparison) -> str:
         ],
         "finding": sentences.finding(comparison),
         "doubts": [
+            *sentences.warning_lines(sequence.notes),
             *sentences.doubt_of_identities(comparison),
             *sentences.outliers(comparison),
             *sentences.withheld_lines(comparison),
-            *sentences.warning_lines(sequence.notes),
         ],
         "failed": text_table(
             "failed",

@@ -68,15 +68,15 @@ def summary(comparison: Comparison) -> Group:
 
 
 def _lines_below(comparison: Comparison, metric: str | None) -> list[str]:
-    """Failures, warnings, and the meaning of the columns."""
+    """Failures, doubts of the log, what runs say that may follow from these, and the meaning of the columns."""
     lines = ensemble_sentences(comparison.ensembles)
     lines += [f"{run.estimator} failed: {run.reason}" for run in comparison.failed_runs]
+    lines += sentences.doubt_lines(comparison.sequence.notes)
     lines += sentences.lost_runs(comparison)
     lines += sentences.refusal_lines(comparison)
     lines += sentences.withheld_lines(comparison)
     lines += [*sentences.doubt_of_identities(comparison), *sentences.outliers(comparison)]
     lines += sentences.nameless_landmarks(comparison)
-    lines += sentences.doubt_lines(comparison.sequence.notes)
     if comparison.recognition is not None:
         found = comparison.recognition
         warned = [f"{n} x {reason}" for reason, n in found.warned().items()]

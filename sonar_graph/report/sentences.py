@@ -50,6 +50,7 @@ UNHEARD = {Outcome.UNSOUND, Outcome.LATE, Outcome.UNLOCATED, Outcome.TRACK_REPEA
 POLICY, UNKNOWN = "identity.policy", "identity.unknown.policy"
 WARNING = "Warning"
 SAID_NOTES = {
+    "log.sensors": WARNING,
     "log.ending": "Log",
     "log.damage": "Log",
     "log.start": "Log",
@@ -57,9 +58,8 @@ SAID_NOTES = {
     "log.dropped": "Log, left out",
     "log.warnings": WARNING,
     "log.gaps": WARNING,
-    "log.sensors": WARNING,
 }
-"""Notes that the terminal shows, and the word before each; the report has all notes."""
+"""Notes that the terminal shows, and the word before each, causes first; the report has all notes."""
 
 
 def finding(comparison: Comparison) -> list[str]:
