@@ -241,13 +241,22 @@ def outliers(comparison: Comparison) -> list[str]:
             is_used = np.array([outcome is Outcome.USED for outcome in log.outcomes], np.bool_)
             squares = squares[np.isfinite(squares) & is_used]
             if (far := np.count_nonzero(squares > ABSURD)) > OUTLYING_SHARE * len(squares):
-                said.append(f"{far} of {len(squares)} with {run.estimator}")
+                said.append(f"{run.estimator} {far} of {len(squares)}{_weight(flattened(run.params))}")
     if not said:
         return []
     return [
-        f"{WARNING}: detections that were used are outliers, {', '.join(said)} (as far off as one in a billion should"
-        " be); look at ranges, azimuths and identities, then at noise and start"
+        f"{WARNING}: sonar, detections that were used although as far off as one in a billion should be: "
+        f"{'; '.join(said)}: look at their ranges, azimuths and identities, then at noise and start"
     ]
+
+
+def _weight(settings: Mapping[str, object]) -> str:
+    """How much an outlier counts by the kernel of these settings, with a comma before; empty where they have none."""
+    kernels = [name for name in ("kernel.shape", "kernel_width") if name in settings]
+    if not kernels:
+        return ""
+    has_kernel = settings[kernels[0]] not in ("none", 0)
+    return ", with less weight by its kernel" if has_kernel else f", with full weight ({kernels[0]} sets a kernel)"
 
 
 def nameless_landmarks(comparison: Comparison) -> list[str]:

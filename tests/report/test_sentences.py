@@ -425,7 +425,8 @@ def test_outliers_among_used_detections_are_named_from_a_twentieth_on():
         return sentences.outliers(with_map(IDS, [0.0] * 4, detections=log))
 
     (line,) = said(6)
-    assert line.startswith("Warning: detections that were used are outliers, 6 of 100 with isam2 (")
+    told = "Warning: sonar, detections that were used although as far off as one in a billion should be: "
+    assert line.startswith(f"{told}isam2 6 of 100: look at their ranges")
     assert line in printed(with_map(IDS, [0.0] * 4, detections=log_of([Outcome.USED] * 9, [1.0] * 9)), 300).replace(
         "9 of 9", "6 of 100"
     )
@@ -435,3 +436,18 @@ def test_outliers_among_used_detections_are_named_from_a_twentieth_on():
     assert not said(6, off_m=0.999 * limit_m)
     assert said(6, off_m=1.001 * limit_m)
     assert not sentences.outliers(with_map(IDS, [0.0] * 4, detections=log_of([], [])))
+
+
+@pytest.mark.parametrize(
+    ("params", "told"),
+    [
+        ({"kernel": {"shape": "cauchy", "width": 1.5}}, ", with less weight by its kernel: look"),
+        ({"kernel": {"shape": "none"}}, ", with full weight (kernel.shape sets a kernel): look"),
+        ({"kernel_width": 1.5}, ", with less weight by its kernel: look"),
+        ({"kernel_width": 0.0}, ", with full weight (kernel_width sets a kernel): look"),
+    ],
+)
+def test_of_outliers_that_were_used_is_told_how_much_they_count(params, told):
+    comparison = with_map(IDS, [0.0] * 4, detections=log_of([Outcome.USED] * 9, [1.0] * 9))
+    (line,) = sentences.outliers(with_run(comparison, replace(comparison.runs[0], params=params)))
+    assert f"isam2 9 of 9{told}" in line
