@@ -153,10 +153,12 @@ def test_what_a_killed_command_left_is_removed_by_the_next_one_and_nothing_else(
     assert not (tmp_path / "runs").exists()
 
 
-def test_a_folder_without_files_stays_of_its_kind_and_one_that_failed_has_none(tmp_path):
-    with pytest.raises(RuntimeError):
-        write(tmp_path / "failed", {"a.json": "1"}, error=RuntimeError)
-    assert not list((tmp_path / "failed").iterdir())
+def test_a_folder_without_files_stays_of_its_kind_and_one_that_failed_is_left_as_it_was(tmp_path):
+    (tmp_path / "there").mkdir()
+    for name in ("made", "there"):
+        with pytest.raises(RuntimeError):
+            write(tmp_path / name, {"a.json": "1"}, error=RuntimeError)
+    assert [path.name for path in tmp_path.rglob("*")] == ["there"]
     with result_written(tmp_path / "empty", "batch"):
         pass
     assert kind_of(tmp_path / "empty") == "batch"

@@ -14,11 +14,11 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from sonar_graph.cli.arguments import printable
 from sonar_graph.errors import EvaluationError, LogError, SonarGraphError
-from sonar_graph.files import COMPARISON, read_json, result_folder
+from sonar_graph.files import COMPARISON, folder_for_use, read_json, result_folder
 
 
 def writable_log(path: Path, source: Path | None = None, *, overwrite: bool = False) -> Path:
-    """Check that a log can be written, make its folder, and return ``path``.
+    """Check that a log can be written, and return ``path``.
 
     The source, a file or folder, is never overwritten; a file that this package did not write, only if asked for.
 
@@ -40,7 +40,7 @@ def writable_log(path: Path, source: Path | None = None, *, overwrite: bool = Fa
 def writable_json(
     path: Path, sources: Iterable[Path], is_own: Callable[[dict[str, Any]], bool], *, overwrite: bool = False
 ) -> Path:
-    """Check that a JSON file can be written, make its folder, and return ``path``.
+    """Check that a JSON file can be written, and return ``path``.
 
     Raises `EvaluationError` when it is one of the sources, cannot be written, or has a content that is not ``is_own``.
     """
@@ -102,10 +102,9 @@ def _is_replaceable(path: Path) -> bool:
 
 
 def _require_writing_in(folder: Path, path: Path, refusal: type[SonarGraphError]) -> None:
-    """Make a folder and try to write there; an error names the path that was asked for."""
+    """Try to write to a folder, made for that if need be; an error names the path that was asked for."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with TemporaryFile(dir=folder):
+        with folder_for_use(folder), TemporaryFile(dir=folder):
             pass
     except OSError as error:
         raise refusal(f"{path}: cannot be written: {error.strerror}; choose another place with -o") from error

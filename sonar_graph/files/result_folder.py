@@ -158,7 +158,7 @@ _held: dict[tuple[Path, int], ResultFolder] = {}
 def result_folder(
     path: Path, kind: str, *, overwrite: bool = False, refusal: type[SonarGraphError] = EvaluationError
 ) -> Iterator[ResultFolder]:
-    """Make a folder and keep every other command out of it while the block runs.
+    """Make a folder and keep every other command out of it while the block runs; unused, it is removed again.
 
     `result_written` of the same thread writes to it; ``overwrite`` of this block holds. The operating system releases
     the lock when the process ends, also by SIGKILL; the file that stays means nothing.
@@ -170,8 +170,26 @@ def result_folder(
     OSError
         When the folder cannot be made.
     """
+    with folder_for_use(path), _locked(path, kind, refusal, overwrite=overwrite) as folder:
+        yield folder
+
+
+@contextmanager
+def folder_for_use(path: Path) -> Iterator[None]:
+    """Make a folder and its parents; those of them that nothing was put into are removed when the block ends."""
+    made = [folder for folder in (path, *path.parents) if not folder.exists()]
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        yield
+    finally:
+        for folder in made:
+            with contextlib.suppress(OSError):  # something is in it
+                folder.rmdir()
+
+
+@contextmanager
+def _locked(path: Path, kind: str, refusal: type[SonarGraphError], *, overwrite: bool) -> Iterator[ResultFolder]:
     place = path.absolute(), threading.get_ident()
-    path.mkdir(parents=True, exist_ok=True)
     is_new = not os.path.lexists(path / LOCK)
     flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
     try:

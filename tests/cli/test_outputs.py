@@ -121,6 +121,19 @@ def test_commands_can_be_repeated_over_what_they_wrote_and_over_nothing(run, tmp
     assert (tmp_path / "link.mcap").stat().st_size > 0
 
 
+def test_a_refused_command_leaves_no_folder_that_it_made_and_every_one_that_was_there(run, basin, tmp_path):
+    unreadable, there = tmp_path / "words.mcap", tmp_path / "there"
+    unreadable.write_text("words")
+    there.mkdir()
+    for place in (tmp_path / "made" / "below", there, there / "below"):
+        assert run("compare", unreadable, "-o", place, *QUICK) == 2
+        assert run("run", basin, "-o", place, "--estimator", "dead-reckoning", "--rate-hz", "1e6") == 2
+        assert run("convert", "mrclam", tmp_path, "--robot", "1", "-o", place / "log.mcap") == 2
+        assert {basin, unreadable, there} == set(tmp_path.iterdir())
+        assert not list(there.iterdir())
+    assert run("compare", basin, "-o", tmp_path / "made" / "below", *QUICK) == 0
+
+
 OURS = ["recognised/1.jpg", "runs/dead-reckoning/result.json", "report.html", "comparison.json"]
 THEIRS = ["recognised/mine.jpg", "runs/mine/result.json", ".log.mcap.partial", ".partial-log.mcap", "log.mcap.part"]
 

@@ -60,11 +60,11 @@ def test_simulation_flags_and_settings_reach_the_simulator(run, tmp_path, monkey
     monkeypatch.setattr("sonar_graph.simulation.simulate_basin", given_options.append)
     monkeypatch.setattr("sonar_graph.logs.write_log", lambda path, _: path.touch())
     flags = ("--seed", 7, "--laps", 2, "--imu", "mti1", "--no-bias", "--set", "wrong_id_rate=0.05")
-    assert run("simulate", "basin", "-o", tmp_path / "new" / "basin.mcap", *flags) == 0
+    assert run("simulate", "basin", "-o", tmp_path / "basin.mcap", *flags) == 0
     options = given_options[0]
     assert (options.seed, options.laps, options.imu) == (7, 2, "mti1")
     assert (options.gyro_bias_scale, options.wrong_id_rate) == (0.0, 0.05)
-    assert capsys.readouterr().out == f"Log: {tmp_path / 'new' / 'basin.mcap'}\n"
+    assert capsys.readouterr().out == f"Log: {tmp_path / 'basin.mcap'}\n"
 
 
 @pytest.fixture(scope="module")
