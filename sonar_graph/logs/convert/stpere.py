@@ -42,6 +42,7 @@ FIX_COLUMNS = (
     *("time", "latitude", "longitude", "status", "height", "geoid height"),
     *("true course", "magnetic course", "knots", "km/h"),
 )
+FILES = {"MTI.log": MTI_COLUMNS, "DVL.log": DVL_COLUMNS, "DGPS.log": FIX_COLUMNS}
 BODY_YAW_IMU_RAD = -np.pi / 2
 BODY_YAW_DVL_RAD = -np.pi / 3
 GYRO_Z_BIAS_RAD_S = -0.0116
@@ -69,11 +70,13 @@ def read_stpere(dataset_dir: Path) -> Sequence:
     DatasetError
         When the folder does not exist, or a file is missing or malformed.
     """
+    advice = f"give the folder that holds {', '.join(FILES)}"
     if not dataset_dir.is_dir():
-        raise DatasetError(f"{dataset_dir}: is not a folder; give the folder that holds MTI.log, DVL.log and DGPS.log")
+        raise DatasetError(f"{dataset_dir}: is not a folder; {advice}")
+    if missing := [name for name in FILES if not (dataset_dir / name).exists()]:
+        raise DatasetError(f"{dataset_dir}: holds no {', '.join(missing)}; {advice}")
     inertial, doppler, fixes = (
-        read_table(dataset_dir / name, columns, comment="%", encoding="latin-1")
-        for name, columns in (("MTI.log", MTI_COLUMNS), ("DVL.log", DVL_COLUMNS), ("DGPS.log", FIX_COLUMNS))
+        read_table(dataset_dir / name, columns, comment="%", encoding="latin-1") for name, columns in FILES.items()
     )
     imu, bias = _inertial_rows(inertial)
     has_lock = doppler.values[:, DVL_COLUMNS.index("bottom status")] == 1

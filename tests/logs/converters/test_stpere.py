@@ -44,9 +44,12 @@ def test_axes_units_and_biases_are_those_found_in_the_data(folder):
 
 
 def test_a_missing_file_or_folder_is_named(folder):
-    with pytest.raises(DatasetError, match=r"absent: is not a folder; .* MTI\.log, DVL\.log and DGPS\.log"):
+    with pytest.raises(DatasetError, match=r"absent: is not a folder; .* MTI\.log, DVL\.log, DGPS\.log$"):
         read_stpere(folder / "absent")
     (folder / "DVL.log").unlink()
+    with pytest.raises(DatasetError, match=rf"{folder.name}: holds no DVL\.log; give the folder that holds MTI"):
+        read_stpere(folder)
+    (folder / "DVL.log").mkdir()
     with pytest.raises(DatasetError, match=r"DVL\.log: cannot be read"):
         read_stpere(folder)
 
