@@ -12,13 +12,13 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from sonar_graph.cli.arguments import printable
+from sonar_graph.cli.arguments import echo, printable
 from sonar_graph.errors import EvaluationError, LogError, SonarGraphError
 from sonar_graph.files import COMPARISON, folder_for_use, read_json, result_folder
 
 
 def writable_log(path: Path, source: Path | None = None, *, overwrite: bool = False) -> Path:
-    """Check that a log can be written, and return ``path``.
+    """Check that a log can be written, say whether it replaces another, and return ``path``.
 
     The source, a file or folder, is never overwritten; a file that this package did not write, only if asked for.
 
@@ -34,6 +34,8 @@ def writable_log(path: Path, source: Path | None = None, *, overwrite: bool = Fa
     if not (overwrite or _is_replaceable(path)):
         raise LogError(f"{path}: exists, and sonar-graph did not write it; choose another name, or give --overwrite")
     _require_writing_in(path.parent, path, LogError)
+    if path.exists() and path.stat().st_size:
+        echo(f"Replaces {path}", err=True)
     return path
 
 

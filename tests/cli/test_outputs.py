@@ -110,11 +110,13 @@ def test_what_another_program_wrote_is_replaced_only_when_asked_for(content, run
     assert log.read_bytes() != before
 
 
-def test_commands_can_be_repeated_over_what_they_wrote_and_over_nothing(run, tmp_path):
+def test_commands_can_be_repeated_over_what_they_wrote_and_say_so_and_over_nothing(run, tmp_path, capsys):
     log = tmp_path / "log.mcap"
     log.touch()  # an empty file holds nothing to lose
-    for _ in range(2):
+    for told in ("", f"Replaces {log}\n"):
+        capsys.readouterr()
         assert run("convert", "victoria-park", "-o", log) == 0
+        assert capsys.readouterr().err == told
         assert run("simulate", "basin", "--duration-s", "120", "--laps", "1", "-o", log) == 0
     (tmp_path / "link.mcap").symlink_to(tmp_path / "missing.mcap")
     assert run("convert", "victoria-park", "-o", tmp_path / "link.mcap") == 0
