@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Floats, Ints
@@ -21,6 +20,8 @@ USED, GATED, NEW, LET_IN = (OUTCOME_NUMBERS[o] for o in (Outcome.USED, Outcome.G
 OUTLYING, JUDGED_TOGETHER = -2.0 * math.log(0.001), 10
 """Squared Mahalanobis distance that one right detection in a thousand exceeds, and number of detections of which most
 tell: with a tenth of outliers six of ten are so once in 7,000 times, ``P(Bin(10, 0.1) > 5) = 1.5e-4``."""
+MEDIAN = 2.0 * math.log(2.0)
+"""Of a squared Mahalanobis distance of two numbers."""
 MOST_LANDMARKS = 1 << 16
 
 
@@ -60,19 +61,19 @@ class Gate(NamedTuple):
     """Squared Mahalanobis distance beyond which an innovation is refused."""
     width: float
     """Of the kernel, in standard deviations; infinite: none."""
-    outlying: NDArray[np.bool_]
-    """Which of the last detections were outliers, as a ring."""
-    has_agreed: NDArray[np.bool_]
-    """Landmarks of which a detection was no outlier, by place in the state, modulo its length."""
+    squared: Floats
+    """Squared Mahalanobis distances of the last detections of trusted landmarks, as a ring."""
     judged: Ints
-    """Number of their detections so far, shape (1,)."""
+    """Number of these detections so far, shape (1,)."""
+    agreed: Ints
+    """Number of detections that were no outliers, by the landmark's place in the state, modulo its length."""
 
     @classmethod
     def of(cls, gate_probability: float, kernel_width: float) -> "Gate":
         """The gate and kernel of a filter's settings (`FilterParams`), with nothing judged yet."""
         threshold, width = gate_threshold(gate_probability, 2), kernel_width or math.inf
-        outlying, has_agreed = np.zeros(JUDGED_TOGETHER, np.bool_), np.zeros(MOST_LANDMARKS, np.bool_)
-        return cls(threshold, width, outlying, has_agreed, np.zeros(1, np.int64))
+        squared, agreed = np.zeros(JUDGED_TOGETHER), np.zeros(MOST_LANDMARKS, np.int64)
+        return cls(threshold, width, squared, np.zeros(1, np.int64), agreed)
 
 
 @compiled
@@ -80,21 +81,23 @@ def admit(e: Floats, S: Floats, R_z: Floats, gate: Gate, landmark: int) -> tuple
     """Judge an innovation of range and azimuth: `USED`, `GATED` or `LET_IN`, and what the kernel adds to R_z (2, 2).
 
     The kernel's weights w_i at ``e_i / sqrt(S_ii)`` make ``R_ij / sqrt(w_i w_j)`` of the noise. While most of the last
-    detections of landmarks that have agreed before are outliers, the filter is wrong, not they: no gate, no kernel. One
-    that never agreed may have begun by a wrong name. docs/theory/fair_comparison.md.
+    detections of trusted landmarks are outliers, S is too small: the gate takes it times what makes the median of these
+    fit, and there is no kernel. A landmark is trusted after as many agreements as it takes outliers for that; one that
+    began by a wrong name has hardly any. docs/theory/fair_comparison.md.
     """
     squared = S[1, 1] * e[0] ** 2 - 2.0 * S[0, 1] * e[0] * e[1] + S[0, 0] * e[1] ** 2
     squared /= S[0, 0] * S[1, 1] - S[0, 1] ** 2
-    widened, is_inside = np.zeros((2, 2)), squared <= gate.threshold
-    is_outlier, landmark = not squared <= OUTLYING, landmark % MOST_LANDMARKS
-    if gate.has_agreed[landmark]:
-        gate.outlying[gate.judged[0] % JUDGED_TOGETHER] = is_outlier
+    widened, landmark = np.zeros((2, 2)), landmark % MOST_LANDMARKS
+    if 2 * gate.agreed[landmark] > JUDGED_TOGETHER:
+        gate.squared[gate.judged[0] % JUDGED_TOGETHER] = squared
         gate.judged[0] += 1
-    gate.has_agreed[landmark] |= not is_outlier
-    if 2 * gate.outlying.sum() > JUDGED_TOGETHER:
-        return USED if is_inside else LET_IN, widened
-    if not is_inside:
+    gate.agreed[landmark] += squared <= OUTLYING
+    is_too_small = 2 * np.sum(gate.squared > OUTLYING) > JUDGED_TOGETHER
+    excess = np.median(gate.squared) / MEDIAN if is_too_small else 1.0
+    if not squared <= excess * gate.threshold:
         return GATED, widened
+    if is_too_small:
+        return USED if squared <= gate.threshold else LET_IN, widened
     spread = np.empty(2)
     for i in range(2):
         spread[i] = math.sqrt(1.0 + e[i] ** 2 / (S[i, i] * gate.width**2))

@@ -340,25 +340,50 @@ def test_an_outlier_moves_a_filter_with_a_kernel_less_and_what_agrees_as_much(fi
         assert shares[0] - 1e-3 < moved[1] / moved[0] < shares[1] + 1e-3
 
 
+def judge(gate, squared, times=1, landmark=3):
+    """Outcomes and what the kernel adds, of detections at a squared distance along the range."""
+    return [admit(np.array([math.sqrt(squared), 0.0]), np.eye(2), NOISE, gate, landmark) for _ in range(times)]
+
+
+def outcomes(told):
+    return [outcome for outcome, _ in told]
+
+
 def test_a_gate_refuses_a_few_outliers_and_opens_when_most_are():
     """Of the last ten; it closes again when most are not. One in a thousand right ones is an outlier."""
-    gate, S = Gate.of(0.99, 0.0), np.eye(2)
-
-    def judge(squared, times=1, landmark=3):
-        return [admit(np.array([math.sqrt(squared), 0.0]), S, NOISE, gate, landmark) for _ in range(times)]
-
+    gate = Gate.of(0.99, 0.0)
     assert JUDGED_TOGETHER == 10
     assert pytest.approx(chi2.ppf(0.999, 2)) == OUTLYING
-    told = judge(1.0, 7) + judge(100.0, 8)
-    assert [outcome for outcome, _ in told] == [USED] * 7 + [GATED] * 5 + [LET_IN] * 3
-    assert not np.any([widened for outcome, widened in told if outcome == LET_IN])
-    assert [outcome for outcome, _ in judge(1.0, 5) + judge(100.0)] == [USED] * 5 + [GATED]
+    assert outcomes(judge(gate, 1.0, 7) + judge(gate, 100.0, 8)) == [USED] * 7 + [GATED] * 5 + [LET_IN] * 3
+    assert outcomes(judge(gate, 1.0, 5) + judge(gate, 100.0)) == [USED] * 5 + [GATED]
     always = Gate.of(0.99, 0.0)  # outside the gate, but no outliers
-    told = [admit(np.array([math.sqrt(OUTLYING - 0.1), 0.0]), S, NOISE, always, 0)[0] for _ in range(20)]
-    assert told == [GATED] * 20
-    judge(1.0, 10)
-    assert [outcome for outcome, _ in judge(100.0, 20, landmark=7)] == [GATED] * 20  # begun by a wrong name
-    assert [outcome for outcome, _ in judge(1.0, 1, landmark=7) + judge(100.0, 6, landmark=7)][-1] == LET_IN
+    assert outcomes(judge(always, OUTLYING - 0.1, 20)) == [GATED] * 20
+
+
+@pytest.mark.parametrize("kernel_width", [0.0, 1.5])
+def test_an_open_gate_is_the_ellipse_times_what_makes_the_median_fit_without_kernel(kernel_width):
+    """So that it goes on refusing what is a wrong name even then."""
+    gate = Gate.of(0.99, kernel_width)
+    judge(gate, 1.0, 6)
+    judge(gate, 200.0, 10)
+    judge(gate, 1e5, 4)  # wrong names among them
+    limit = gate_threshold(0.99, 2) * 200.0 / chi2.ppf(0.5, 2)
+    told = [judge(gate, squared, landmark=5)[0] for squared in (9.2, 9.3, 0.999 * limit, 1.001 * limit)]
+    assert outcomes(told) == [USED, LET_IN, LET_IN, GATED]
+    assert not np.any([widened for _, widened in told])
+
+
+def test_a_landmark_that_began_by_a_wrong_name_opens_no_gate_even_if_the_same_confusion_returns():
+    """Nor is it let in where one that has agreed opens it; that takes as many agreements as outliers."""
+    gate = Gate.of(0.99, 0.0)
+    judge(gate, 1.0, 16, landmark=3)
+    for _ in range(5):
+        told = judge(gate, 1.0, landmark=7) + judge(gate, 1e5, 20, landmark=7)
+        assert outcomes(told) == [USED] + [GATED] * 20
+    assert outcomes(judge(gate, 30.0, 6))[-1] == LET_IN
+    assert outcomes(judge(gate, 1e5, landmark=7)) == [GATED]
+    judge(gate, 1.0, 10)
+    assert outcomes(judge(gate, 1.0, landmark=7) + judge(gate, 1e5, 6, landmark=7))[-1] == LET_IN
 
 
 BEFORE_S, LOST_S, AFTER_S = 25.0, 120.0, np.array([3.0, 10.0, 20.0])
