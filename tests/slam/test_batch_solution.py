@@ -208,6 +208,15 @@ def test_a_solution_tries_no_more_steps_than_two_descents_may(most, monkeypatch)
     assert graph.error(freely) < graph.error(bounded) < graph.error(initial)
 
 
+def test_what_is_held_stays_while_the_rest_is_solved_for():
+    """A prior would move it by a metre."""
+    step = gtsam.Pose3(gtsam.Rot3.Rz(0.1), np.array([1.0, 0.0, 0.0]))
+    graph = graph_of([pose_prior(X(0), step, 0.1), gtsam.BetweenFactorPose3(X(0), X(1), step, isotropic(6, 0.1))])
+    found = batch_solution.descended(graph, values_of(X0=gtsam.Pose3(), X1=gtsam.Pose3()), 20, [X(0)])[0]
+    assert found.atPose3(X(0)).equals(gtsam.Pose3(), 1e-6)
+    assert found.atPose3(X(1)).equals(step, 1e-6)
+
+
 def test_what_still_moves_is_solved_for_by_itself_to_the_same_solution(monkeypatch: pytest.MonkeyPatch):
     """One keyframe of forty starts far off; of the others none moves while it is solved for."""
     step, noise = gtsam.Pose3(gtsam.Rot3.Rz(0.1), np.array([1.0, 0.0, 0.0])), isotropic(6, 0.1)
@@ -222,8 +231,9 @@ def test_what_still_moves_is_solved_for_by_itself_to_the_same_solution(monkeypat
 
     def watched(stacked: StackedGraph, keyframes: list[int], at: gtsam.Values):
         part, some = around(stacked, keyframes, at)
-        solved = batch_solution.descended(part, some, 20, 1e-9)[0]
         held = [key for key in list(some.keys()) if key not in keyframes]
+        solved = batch_solution.descended(part, some, 20, held)[0]
+        assert held
         assert all(solved.atPose3(key).equals(some.atPose3(key), 1e-6) for key in held)
         parts.append(keyframes)
         return part, some

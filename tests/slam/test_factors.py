@@ -17,7 +17,8 @@ from sonar_graph.calibration import Calibration, PlanarMotion, Start
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation.joint_preintegration import JointMotion, JointPreintegrator
-from sonar_graph.slam.models import HUBER_WIDTHS, OdometryStack, OdometryWithBias, factors
+from sonar_graph.slam.models import HUBER_WIDTHS, OdometryStack, OdometryWithBias, RobustKernel, factors
+from sonar_graph.slam.models.correlated_sighting import SightingStack
 from sonar_graph.slam.models.inertial_factors import doppler_odometry, inertial_doppler_odometry
 from sonar_graph.slam.models.views import range_azimuth
 from sonar_graph.testing import check_consistent, check_jacobians
@@ -453,6 +454,25 @@ def test_twelve_rows_need_a_measured_specific_force():
         made(unfelt, True, False)
     assert np.isfinite(made(unfelt, False, False).unwhitenedError(fitting(motion, 1, 0.1))).all()
     made(motion, True, False)
+
+
+def test_correlated_sightings_together_are_what_each_is():
+    """Under no kernel and two others, wherever the landmarks lie about the sonars."""
+    rng, values, made = np.random.default_rng(6), gtsam.Values(), []
+    kernels = [plain, RobustKernel(shape="huber").robust(), RobustKernel(shape="cauchy").robust()]
+    for k in range(5):
+        values.insert(X(k), gtsam.Pose3.Expmap(rng.standard_normal(6)))
+        values.insert(L(k), 3.0 * rng.standard_normal(3))
+    for k in range(60):
+        body_T_sonar, half = gtsam.Pose3.Expmap(rng.standard_normal(6)), 0.1 * rng.standard_normal((2, 2))
+        z, cov = rng.uniform((1.0, -3.0), (5.0, 3.0)), half @ half.T + 1e-3 * np.eye(2)
+        keys = X(int(rng.integers(5))), L(int(rng.integers(5)))
+        made.append(factors.correlated_sighting(*keys, body_T_sonar, z, cov, kernels[k % 3]))
+    stack = SightingStack(made)
+    assert stack.error(values) == pytest.approx(sum(factor.error(values) for factor in made), rel=1e-12)
+    for found, factor in zip(stack.linear_factors(values), made, strict=True):
+        mine, theirs = found.augmentedInformation(), factor.linearize(values).augmentedInformation()
+        assert mine == pytest.approx(theirs, rel=1e-9, abs=1e-9 * np.abs(theirs).max())
 
 
 def test_odometry_factors_together_are_what_each_is():

@@ -8,8 +8,9 @@
                    └── range, azimuth ── L7 ── floor prior
     depth, gravity direction and the planar constraint: one keyframe each
 
-All but those that depend on biases (`biased_odometry`) are GTSAM's own (compiled) factors. Range and azimuth are two:
-elevation stays unknown. ``RangeFactorWithTransform3D``, and for azimuth a camera whose optical axis lies in the
+All but those that depend on biases (`biased_odometry`) or whose noises are correlated (`correlated_sighting`) are
+GTSAM's own (compiled). Range and azimuth are two: elevation stays unknown. ``RangeFactorWithTransform3D``, and for
+azimuth a camera whose optical axis lies in the
 sonar's fan plane along the measured azimuth, with the equidistant projection (Kannala and Brandt, IEEE PAMI 28(8),
 2006): a direction at angle t from the axis has an image point at distance t from its centre. Its horizontal coordinate
 is ``azimuth - measured`` at elevation 0, times ``e / tan(e)`` at a small elevation e (0.995 at 7 degrees); the vertical
@@ -28,9 +29,9 @@ from sonar_graph.navigation import PreintegratedMotion
 from sonar_graph.numerics import cross_matrix
 from sonar_graph.slam.biases import ACCEL, COMPASS
 from sonar_graph.slam.models.aiding import HUBER_WIDTHS, yaw_and_derivative
+from sonar_graph.slam.models.correlated_sighting import CorrelatedSighting
 from sonar_graph.slam.models.kernels import Robust
 from sonar_graph.slam.models.sonar_model import wrap_angle
-from sonar_graph.slam.models.views import range_azimuth_jacobians
 
 UNINFORMATIVE_M = 1e5
 UNINFORMATIVE_RAD = 1e3
@@ -160,15 +161,7 @@ def correlated_sighting(
     pose_key: int, landmark_key: int, body_T_sonar: gtsam.Pose3, z: Floats, cov: Floats, robust: Robust
 ) -> gtsam.NoiseModelFactor:
     """Range and azimuth whose noises are correlated, as one factor: ``h(X, L) - z``, azimuth wrapped."""
-
-    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:
-        X, p = values.atPose3(pose_key), values.atPoint3(landmark_key)
-        predicted, by_pose, by_landmark = range_azimuth_jacobians(X, body_T_sonar, p)
-        if jacobians is not None:
-            jacobians[0], jacobians[1] = by_pose, by_landmark
-        return np.array([predicted[0] - z[0], wrap_angle(predicted[1] - z[1])])
-
-    return gtsam.CustomFactor(robust(gaussian(cov)), [pose_key, landmark_key], error)
+    return CorrelatedSighting(pose_key, landmark_key, body_T_sonar, z, robust(gaussian(cov)))
 
 
 def first_direction(pose_key: int, landmark_key: int, body_p_landmark: Floats) -> gtsam.NonlinearFactor:

@@ -12,10 +12,18 @@ import math
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from sonar_graph.measurements import Floats
 from sonar_graph.numerics import compiled
 from sonar_graph.slam.models.sonar_model import sonar_point, sonar_point_jacobian
+
+
+def poses_of(values: gtsam.Values, keys: NDArray[np.uint64]) -> Floats:
+    """Poses of a graph by the keys of keyframes, shape (...): rows of R, and p, shape (..., 12)."""
+    known = np.fromiter(values.keys(), np.uint64)
+    poses = np.asarray(gtsam.utilities.extractPose3(values))  # by ascending key
+    return poses[np.searchsorted(known[known >> np.uint64(56) == ord("x")], keys)]
 
 
 @compiled

@@ -11,7 +11,7 @@ sightings say where to start it instead (docs/theory/isam2.md).
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -34,9 +34,10 @@ DAMPING_FACTOR = 10.0
 MAX_DAMPING = 1e9
 MOVING = 0.1
 """Share of the largest move of a keyframe in a step from which on another one moves much."""
-FEW = 0.25
+FEW = 0.4
 """Share of keyframes up to which they are solved for by themselves."""
 MAX_STEPS_OF_PART = 20
+"""Steps that the solution of a part may try by itself. Its own parts may begin until they have tried `MAX_STEPS`."""
 HELD = 1e-6
 """Standard deviation of what is held meanwhile, rad or m."""
 
@@ -89,24 +90,17 @@ class StackedGraph:
 
     def unsettled(self, step: gtsam.VectorValues) -> list[int]:
         """Keyframes that a step moves at least a tenth as far as the one that it moves most, where these are few."""
-        moves = {key: np.abs(step.at(key)).max() for key in self._on}
-        least = MOVING * max(moves.values(), default=0.0)
-        found = [key for key, move in moves.items() if move > least]
-        return found if len(found) < FEW * len(moves) else []
+        keyframes = list(self._on)
+        moves = np.abs(step.vector(keyframes)).reshape(-1, 6).max(axis=1, initial=0.0)
+        found = np.flatnonzero(moves > MOVING * moves.max(initial=0.0)).tolist()
+        return [keyframes[i] for i in found] if len(found) < FEW * len(moves) else []
 
     def around(self, keyframes: list[int], values: gtsam.Values) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-        """Factors on some keyframes, with the values of their variables, of which all others are held."""
-        part, moving = gtsam.NonlinearFactorGraph(), set(keyframes)
+        """Factors on some keyframes, and the values of their variables."""
+        part = gtsam.NonlinearFactorGraph()
         for i in sorted({i for key in keyframes for i in self._on[key]}):
             part.add(self.factors[i])
-        keys = list(part.keyVector())
-        some = picked(values, keys)
-        for key in keys:
-            if key not in moving:
-                n = tangent_size(key)
-                tight = gtsam.JacobianFactor(key, np.eye(n) / HELD, np.zeros(n), gtsam.noiseModel.Unit.Create(n))
-                part.add(gtsam.LinearContainerFactor(tight, some))
-        return part, some
+        return part, picked(values, list(part.keyVector()))
 
 
 def solve(graph: gtsam.NonlinearFactorGraph, initial: gtsam.Values) -> gtsam.Values:
@@ -118,7 +112,7 @@ def descended(
     graph: gtsam.NonlinearFactorGraph,
     initial: gtsam.Values,
     most_steps: int,
-    least_decrease: float | None = None,
+    held: Collection[int] = (),
 ) -> tuple[gtsam.Values, float, int]:
     """Levenberg–Marquardt from ``initial``, in at most so many steps.
 
@@ -126,23 +120,26 @@ def descended(
     negligible (a Gauss–Newton step) and grows, by 10, 100, 1000 and so on, while a step does not lower the error
     (Nocedal and Wright, Numerical Optimization, section 10.3). A step is doubled while that lowers the error more:
     those of a robust kernel fall short, since its weights are held while a step is solved for. After a step by
-    which few keyframes move much these are solved for, with all else held, before the next step of all.
+    which few keyframes move much these are solved for in the same way, with all else held, before the next step of all.
 
     Parameters
     ----------
-    least_decrease
-        Stop when an iteration lowers the error by less; None: `RELATIVE_DECREASE` of it, or `LEAST_DECREASE`. Where it
-        is given no part is solved for by itself.
+    held
+        Variables that stay where they are.
 
     Returns
     -------
-    The values reached, their error, and the number of steps that were tried.
+    The values reached, their error, and the number of steps that were tried; those of parts count where something is
+    held.
     """
     stacked = StackedGraph(graph)
     values, error = initial, stacked.error(initial)
-    damping, ordering, tried = FIRST_DAMPING, None, 0
+    damping, ordering, tried, in_parts = FIRST_DAMPING, None, 0, 0
+    priors = [prior_of(key, 1 / HELD) for key in held]
     while tried < most_steps:
         linear = stacked.linearize(values)
+        for prior in priors:
+            linear.push_back(prior)
         if ordering is None:
             ordering = gtsam.Ordering.ColamdGaussianFactorGraph(linear)
         candidate, candidate_error, factor = values, np.inf, DAMPING_FACTOR
@@ -169,15 +166,23 @@ def descended(
             candidate, candidate_error = further, further_error
         decrease = error - candidate_error
         values, error = candidate, candidate_error
-        least = max(RELATIVE_DECREASE * error, LEAST_DECREASE) if least_decrease is None else least_decrease
-        if decrease <= least:
+        if decrease <= max(RELATIVE_DECREASE * error, LEAST_DECREASE):
             break
-        if least_decrease is None and (moving := stacked.unsettled(step)):
-            part = descended(*stacked.around(moving, values), MAX_STEPS_OF_PART, least)[0]
+        if (not held or in_parts < MAX_STEPS) and (moving := stacked.unsettled(step)):
+            part, some = stacked.around(moving, values)
+            rest = set(some.keys()).difference(moving)
+            some, _, steps = descended(part, some, MAX_STEPS_OF_PART, rest)
+            in_parts += steps
             values = gtsam.Values(values)
-            values.update(picked(part, moving))
+            values.update(picked(some, moving))
             error = stacked.error(values)
-    return values, error, tried
+    return values, error, tried + in_parts if held else tried
+
+
+def prior_of(key: int, weight: float) -> gtsam.JacobianFactor:
+    """A linear factor by which a variable stays where it is, each component with a standard deviation of 1 / weight."""
+    n = tangent_size(key)
+    return gtsam.JacobianFactor(key, weight * np.eye(n), np.zeros(n), gtsam.noiseModel.Unit.Create(n))
 
 
 def damped_step(
@@ -187,12 +192,10 @@ def damped_step(
     damped = linear
     if damping > FIRST_DAMPING:
         damped = linear.clone()
-        zero = values.zeroVectors()
         for key in linear.keyVector():
-            n, root = len(zero.at(key)), np.sqrt(damping)
-            damped.push_back(gtsam.JacobianFactor(key, root * np.eye(n), np.zeros(n), gtsam.noiseModel.Unit.Create(n)))
+            damped.push_back(prior_of(key, np.sqrt(damping)))
     try:
-        return damped.optimize(ordering)
+        return damped.eliminateSequential(ordering).optimize()
     except RuntimeError:  # Cholesky refuses what is determined, but weakly
         return qr_tree(damped, values).getDelta()
 
@@ -208,7 +211,7 @@ def qr_tree(linear: gtsam.GaussianFactorGraph, values: gtsam.Values) -> gtsam.IS
     held = gtsam.NonlinearFactorGraph()
     for i in range(linear.size()):
         held.push_back(gtsam.LinearContainerFactor(linear.at(i), values))
-    tree.update(held, values)
+    tree.update(held, picked(values, linear.keyVector()))
     return tree
 
 
