@@ -23,6 +23,15 @@ def test_recognition_quotes_what_its_script_prints_and_draws(tmp_path):
     assert drawn.shape == shown.shape
 
 
+def test_the_picture_of_scenes_is_what_its_script_draws(tmp_path):
+    picture = tmp_path / "scenes.png"
+    command = [sys.executable, "-W", "error", THEORY / "sonar_image.py", picture]
+    done = subprocess.run(command, capture_output=True, text=True, encoding="utf-8", timeout=120)
+    assert done.returncode == 0, done.stderr
+    drawn, shown = (cv2.imread(os.fspath(path)) for path in (picture, THEORY.parent / "images" / "scenes.png"))
+    assert drawn.shape == shown.shape
+
+
 def test_lines_quoted_on_the_way_from_the_paper_stand_in_the_files():
     code, quoted = "", []
     for line in (THEORY / "from_the_paper.md").read_text(encoding="utf-8").splitlines():

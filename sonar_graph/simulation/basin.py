@@ -31,6 +31,9 @@ from sonar_graph.simulation.sonar_image import (
     image_along,
     place_landmark,
     scattered_objects,
+    strangers_at,
+    true_mounting,
+    weathered,
 )
 from sonar_graph.simulation.vehicle import PlanarPose, RouteLeg, VehiclePath, drive, follow, hover, smooth_noise, turn
 
@@ -49,6 +52,8 @@ YSHARK = Vehicle(
 WATCHING_M = 1.8
 """Horizontal distance from sonar to landmark while hovering: a slant range of 2.04 m."""
 OBJECTS_ALONG_SIDE_M = (2.2, 3.5, 6.5)
+STRANGERS_ALONG_SIDE_M = (4.35, 5.65)
+"""Strangers lie beside the landmarks, before and behind them, so that a frame can show both."""
 OBJECTS_ASIDE_M = 0.3
 """Stones and patches lie at about these distances along each side, up to `OBJECTS_ASIDE_M` beside it."""
 RAMP_S = 3.0
@@ -56,6 +61,8 @@ TURN_S = 8.0
 FASTEST_M_S = 0.45
 KNOT_S = 0.5
 PAPER_DURATION_S, PAPER_LAPS, PAPER_SPEED_M_S = 2039.0, 3, 0.15
+UNKNOWN_OBJECTS = "unknown objects"
+"""Note of a log with strangers: each thing on the floor that is no landmark, and where it lies."""
 NOTES = {"truth": "exact: a quintic spline", "earth rotation": "neither simulated nor to be removed"}
 
 
@@ -111,6 +118,10 @@ def simulate_basin(options: BasinOptions | None = None) -> Sequence:
     sequence = record("basin", options, YSHARK, path, world, streams, provenance(options))
     if options.image is None:
         return sequence
+    if options.image.strangers:
+        others = [o for o in objects_on_floor(world, options.image, streams.seabed) if o.id < 0]
+        lie = ", ".join(f"{o.kind} at ({o.position_m[0]:.2f}, {o.position_m[1]:.2f})" for o in others)
+        sequence = replace(sequence, notes={**sequence.notes, UNKNOWN_OBJECTS: lie})
     scale = SonarImage(scale="decibel", decibel_span=SONARS[options.image.sonar].decibel_span, full_scale=255)
     sonar = sequence.calibration.sonar.model_copy(update={"image": scale})
     return replace(sequence, detections=None, calibration=sequence.calibration.model_copy(update={"sonar": sonar}))
@@ -148,7 +159,8 @@ def simulate_basin_frames(options: BasinOptions, frames_per_block: int = 32) -> 
     image = options.image or ImageOptions()
     simulator = FrameSimulator(image, objects_on_floor(world, image, streams.seabed), FLOOR_Z_M, options.seed)
     stamps_ns = frame_stamps(options.frame_rate_hz, path.duration_s)
-    yield from image_along(path, YSHARK.sonar, stamps_ns, simulator, frames_per_block)
+    mounting = true_mounting(YSHARK.sonar, image, options.seed)
+    yield from image_along(path, mounting, stamps_ns, simulator, frames_per_block)
 
 
 def _world_and_path(options: BasinOptions, streams: Streams) -> tuple[World, VehiclePath]:
@@ -189,20 +201,26 @@ def designs_laid(image: ImageOptions | None) -> list[LandmarkDesign]:
 
 
 def objects_on_floor(world: World, image: ImageOptions, rng: np.random.Generator) -> list[SeabedObject]:
-    """Landmarks, turned at random, then stones and patches at random spots on the route."""
+    """Landmarks, turned at random and worn, then stones and patches at random spots on the route, then strangers."""
     yaw_rad = rng.uniform(-np.pi, np.pi, len(world.landmark_ids))
     placed = zip(designs_laid(image), world.landmark_positions, yaw_rad.tolist(), strict=True)
-    landmarks = [place_landmark(design, position, yaw, FLOOR_Z_M) for design, position, yaw in placed]
-    spots, corner = [], np.zeros(2)
+    landmarks = [place_landmark(*each, FLOOR_Z_M, image.foam_height_m) for each in placed]
+    wear_rng, strangers_rng = rng.spawn(2)
+    landmarks = [weathered(one, image, own) for one, own in zip(landmarks, wear_rng.spawn(len(landmarks)), strict=True)]
+    spots, beside, corner = [], [], np.zeros(2)
     for heading_rad in -math.pi / 2 * np.arange(SIDES):
         ahead = np.array([math.cos(heading_rad), math.sin(heading_rad)])
         left = np.array([-ahead[1], ahead[0]])
         for along_m in OBJECTS_ALONG_SIDE_M:
             aside_m = rng.uniform(-OBJECTS_ASIDE_M, OBJECTS_ASIDE_M)
             spots.append([*(corner + (along_m + rng.uniform(-0.2, 0.2)) * ahead + aside_m * left), FLOOR_Z_M])
+        for along_m in STRANGERS_ALONG_SIDE_M:
+            aside_m = strangers_rng.uniform(-OBJECTS_ASIDE_M, OBJECTS_ASIDE_M)
+            beside.append([*(corner + along_m * ahead + aside_m * left), FLOOR_Z_M])
         corner = corner + SIDE_M * ahead
     chosen = rng.permutation(np.array(spots))[: image.stones + image.decoys]
-    return landmarks + scattered_objects(chosen, image.stones, rng)
+    others = scattered_objects(chosen, image.stones, rng)
+    return landmarks + others + strangers_at(np.array(beside), image.strangers, -1 - len(others), strangers_rng)
 
 
 def provenance(options: BasinOptions) -> dict[str, str]:
@@ -218,6 +236,8 @@ def provenance(options: BasinOptions) -> dict[str, str]:
     ours += ["error rates of the recogniser"] if options.image is None else ["landmark designs", "image model"]
     ours += [*(text for text, same in chosen.items() if not same)]
     notes = {"from the paper": ", ".join(published), "ours": ", ".join(ours), **NOTES}
+    if options.image and options.image.scene != "easy":
+        notes["scene"] = options.image.scene
     if options.image and options.image.designs is not None:
         laid = ", ".join(f"{design.id}: {design.name}" for design in designs_laid(options.image))
         notes[OWN_DESIGNS] = f"{laid}, of {Path(options.image.designs).name}"

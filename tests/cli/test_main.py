@@ -79,7 +79,7 @@ def test_help_names_defaults_presets_and_roles_as_they_are():
     from sonar_graph.logs.roles import ROLES
     from sonar_graph.simulation.basin import BasinOptions
     from sonar_graph.simulation.options import DVL_PRESETS, IMU_PRESETS
-    from sonar_graph.simulation.sonar_image.imaging_sonar import ImageOptions
+    from sonar_graph.simulation.sonar_image import SCENES, ImageOptions
 
     options = BasinOptions()
     helps = {option.name: option.help for option in commands()["simulate", "basin"].params}
@@ -91,6 +91,7 @@ def test_help_names_defaults_presets_and_roles_as_they_are():
     said = set(re.findall(r"[a-z_]+", helps["settings"].partition("repeated: ")[2].partition(". ")[0]))
     others = BasinOptions.model_fields.keys() - {"seed", "imu", "dvl", "duration_s", "laps", "image"}
     assert said - {"and", "with", "images", "image"} == others | ImageOptions.model_fields.keys()
+    assert all(scene in helps["settings"].partition("image.scene is")[2] for scene in SCENES)
     topic = next(option.help for option in commands()["compare",].params if option.name == "topics")
     assert topic.endswith(f" Roles: {', '.join(ROLES)}.")
 

@@ -59,7 +59,9 @@ HALF_LIFT_RAD = np.radians(15)
 LEAST_AMPLITUDE = 3e-4
 """A beam's pattern below this, 70 dB down, is taken for zero."""
 RAISED_M = 0.003
-"""Higher cells cast a shadow."""
+"""Cells that are this much higher than the lowest floor cast a shadow."""
+SCOUR_M = 0.05
+"""Distance from an object over which ripples reach their height."""
 BEARINGS, DISTANCE_STEP_M = 256, 0.006
 
 
@@ -83,7 +85,14 @@ class FrameSimulator:
         self._floor_z_m = floor_z_m
         self._seed = seed
         sonar = self.sonar
-        self._floor = scatterers(options.texture_shape, options.joints, np.random.default_rng([seed, 0]))
+        self._floor = scatterers(
+            options.texture_shape,
+            options.joints,
+            np.random.default_rng([seed, 0]),
+            options.texture_length_m,
+            options.ripple_length_m,
+            options.ripple_height_m,
+        )
         pulse_sigma_m = sonar.range_resolution_m / (2 * np.sqrt(np.log(2)))  # the Gaussian's square is as wide at half
         self._column_rad = column_rad = sonar.beam_width_rad / COLUMNS_PER_BEAM
         self._tables = tables_of(sonar, column_rad, pulse_sigma_m)
@@ -181,14 +190,15 @@ class FrameSimulator:
             )
             surface, horizon = echoes.no_surface(), echoes.no_horizon()
             near = within(self.objects, position_m, sector.farthest_m / np.cos(sector.half_bearing_rad / 2))
-            laid = laid_out(near, cells)
+            laid = laid_out(near, cells, self._floor.relief_m)
             if laid.relief_m.any() or not np.isnan(laid.amplitude).all():
                 surface = laid
                 if self.options.shadows:
                     steps = int(np.ceil(sector.farthest_m * 1.1 / DISTANCE_STEP_M)) + 1
                     blocked = np.full((BEARINGS, steps), -np.inf, np.float32)
                     horizon = Horizon(blocked, float(np.tan(sector.half_bearing_rad + 0.02)), DISTANCE_STEP_M)
-                    echoes.block_rays(view, surface, horizon, RAISED_M, CELL_M)
+                    raised_m = RAISED_M - self.options.ripple_height_m
+                    echoes.block_rays(view, surface, horizon, raised_m, CELL_M)
             reflection = self.options.floor_reflection if self.options.multipath else 0.0
             floor = self._floor
             echoes.sum_echoes(view, floor.points, floor.texture, surface, horizon, tables, reflection, total)
@@ -258,17 +268,27 @@ def drawn_gain_error_db(sigma_db: float, bins: int, seed: int) -> Floats:
     return sigma_db * (tilt * along + wave / 3 * np.sin(3 * np.pi * along + phase))
 
 
-def laid_out(objects: Sequence[SeabedObject], cells: Cells) -> Surface:
-    """Objects on the cells in view; the later of two covers the earlier."""
+def laid_out(objects: Sequence[SeabedObject], cells: Cells, ripples_m: Floats32 | None) -> Surface:
+    """Objects and ripples on the cells in view; the later of two objects covers the earlier.
+
+    Ripples end within `SCOUR_M` around an object.
+    """
     first_column, end_column = int(cells.spans[:, 0].min()), int(cells.spans[:, 1].max())
     shape = len(cells.spans), end_column - first_column
     amplitude, relief_m = np.full(shape, np.nan, np.float32), np.zeros(shape, np.float32)
+    if ripples_m is not None:
+        rows, columns = cells.first_row + np.arange(shape[0]), first_column + np.arange(shape[1])
+        relief_m = ripples_m[np.ix_(rows % CELLS, columns % CELLS)]
+        for item in objects:
+            y, x = (rows + 0.5) * CELL_M - item.position_m[1], (columns + 0.5) * CELL_M - item.position_m[0]
+            away_m = np.hypot(x, y[:, None]) - item.extent_m
+            relief_m *= np.clip(away_m / SCOUR_M, 0, 1).astype(np.float32)
     for item in objects:
-        rows, own_rows = _overlap(item.first_row - cells.first_row, len(item.amplitude), shape[0])
-        columns, own_columns = _overlap(item.first_column - first_column, item.amplitude.shape[1], shape[1])
+        to_rows, own_rows = _overlap(item.first_row - cells.first_row, len(item.amplitude), shape[0])
+        to_columns, own_columns = _overlap(item.first_column - first_column, item.amplitude.shape[1], shape[1])
         patch = item.amplitude[own_rows, own_columns]
-        amplitude[rows, columns] = np.where(np.isnan(patch), amplitude[rows, columns], patch)
-        relief_m[rows, columns] += item.relief_m[own_rows, own_columns]
+        amplitude[to_rows, to_columns] = np.where(np.isnan(patch), amplitude[to_rows, to_columns], patch)
+        relief_m[to_rows, to_columns] += item.relief_m[own_rows, own_columns]
     return Surface(first_column, amplitude, relief_m)
 
 
@@ -299,6 +319,8 @@ class FrameTruth:
     """Identities of landmarks, negative for other objects, shape (m,)."""
     points_m: Floats
     """Centre of each object in the sonar's frame, shape (n, m, 3)."""
+    kinds: tuple[str, ...]
+    """What each object is: a landmark's design, or the name of another thing, length m."""
     share_in_view: Floats
     """Share of each object's disc inside the fan between half powers and the window, shape (n, m)."""
 
@@ -357,5 +379,6 @@ def frame_truth(positions: Floats, world_R_sonar: Rotation, simulator: FrameSimu
         quaternions_xyzw=world_R_sonar.as_quat(),
         ids=np.array([o.id for o in objects], dtype=np.int64),
         points_m=points_m,
+        kinds=tuple(o.kind for o in objects),
         share_in_view=inside(fan, spread_m).mean(axis=2),
     )

@@ -12,6 +12,7 @@ from pydantic import Field
 
 from sonar_graph.calibration import Section
 from sonar_graph.measurements import Floats
+from sonar_graph.simulation.sonar_image.conditions import SceneConditions
 
 SOUND_SPEED_M_S = 1480.0
 """Fresh water of 20 °C; nothing here depends on it strongly."""
@@ -122,8 +123,8 @@ SonarName = Literal["didson", "aris3000", "oculus1200"]
 SONARS: dict[SonarName, ImagingSonar] = {"didson": DIDSON, "aris3000": ARIS_3000, "oculus1200": OCULUS_M1200D}
 
 
-class ImageOptions(Section):
-    """Surroundings and faults of an imaging sonar."""
+class ImageOptions(SceneConditions):
+    """Surroundings and faults of an imaging sonar, and the conditions of the scene."""
 
     sonar: SonarName = "didson"
     """Sonar model; the window is the same for all."""
@@ -146,8 +147,6 @@ class ImageOptions(Section):
     """One way: fresh water of 17 °C at 1.8 MHz."""
     tvg_error_db: float = Field(1.5, ge=0)
     """Sigma of the tilt from one end of the window to the other which time-varied gain leaves; 0: exact gain."""
-    texture_shape: float | None = Field(5.0, gt=0)
-    """Shape of the floor's K-distribution: its strength is Gamma(shape) over patches of 3 cm; None: even floor."""
     joints: bool = True
     """Bright joints between the plates of the floor, every 0.5 m."""
     shadows: bool = True
@@ -158,8 +157,6 @@ class ImageOptions(Section):
     """Echo by way of the surface against the direct one, after the sonar's pattern."""
     floor_reflection: float = Field(0.5, ge=0, le=1)
     """Amplitude that a floor mirrors forward."""
-    noise_db: float | None = 15.0
-    """Level of the receiver's noise at 2 m, in the scale of `floor_db`; None: none."""
     drop_probability: float = Field(0.01, ge=0, lt=1)
     """Share of the frames that are never recorded."""
     time_offset_s: float = 0.0

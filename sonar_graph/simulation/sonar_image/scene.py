@@ -24,8 +24,8 @@ from sonar_graph.measurements import Floats, Ints
 Floats32 = NDArray[np.float32]
 CELL_M = 0.0032
 CELLS = 1250
-TEXTURE_M = 0.03
-"""Correlation length of the floor's strength."""
+MEANDER_RAD, MEANDER_LENGTHS = 0.8, 3.0
+"""Wandering of ripples' crests: standard deviation of the phase, and over how many ripples it is correlated."""
 JOINT_SPACING_M, JOINT_WIDTH_M, JOINT_DB = 0.5, 0.008, 6.0
 
 
@@ -37,32 +37,62 @@ class Scatterers:
     """Real and imaginary part of the amplitude, then x and y within the cell as shares of it; (1250, 1250, 4)."""
     texture: Floats32
     """Amplitude of the bare floor, mean square 1 but for joints, shape (1250, 1250)."""
+    relief_m: Floats32 | None
+    """Height over the even floor, at most 0, shape (1250, 1250); None: even."""
 
 
-def scatterers(texture_shape: float | None, joints: bool, rng: np.random.Generator) -> Scatterers:
+def smooth_field(length_m: float, rng: np.random.Generator) -> Floats:
+    """Periodic Gaussian random field of unit variance with the correlation ``exp(-(d / length)²)``, (1250, 1250)."""
+    frequency = np.fft.fftfreq(CELLS, CELL_M), np.fft.rfftfreq(CELLS, CELL_M)
+    smoothing = np.exp(-((np.pi * length_m) ** 2) * np.add.outer(frequency[0] ** 2, frequency[1] ** 2) / 2)
+    field = np.fft.irfft2(smoothing * np.fft.rfft2(rng.standard_normal((CELLS, CELLS))), (CELLS, CELLS))
+    return field / field.std()
+
+
+def ripples(length_m: float, height_m: float, rng: np.random.Generator) -> Floats:
+    """Heights of sand ripples, from ``-height_m`` to 0, shape (1250, 1250).
+
+    Sinusoidal, with crests that wander. They run in a random direction, with as many waves along x and y as fit the
+    period.
+    """
+    heading = rng.uniform(-np.pi, np.pi)
+    period_m = CELLS * CELL_M
+    waves_x, waves_y = np.rint(period_m / length_m * np.array([np.cos(heading), np.sin(heading)]))
+    along = 2 * np.pi * np.arange(CELLS) / CELLS
+    phase = waves_y * along[:, None] + waves_x * along + MEANDER_RAD * smooth_field(MEANDER_LENGTHS * length_m, rng)
+    return 0.5 * height_m * (np.cos(phase) - 1)
+
+
+def scatterers(
+    texture_shape: float | None,
+    joints: bool,
+    rng: np.random.Generator,
+    texture_length_m: float = 0.03,
+    ripple_length_m: float = 0.12,
+    ripple_height_m: float = 0.0,
+) -> Scatterers:
     """Draw a floor; its joints are bright lines every half metre.
 
-    ``texture_shape`` is the shape of the Gamma distribution of its strength (mean 1, smooth over `TEXTURE_M` and
-    periodic); None: even.
+    ``texture_shape`` is the shape of the Gamma distribution of its strength (mean 1, smooth over the texture's length
+    and periodic); None: even.
     """
-    points_rng, texture_rng = rng.spawn(2)
+    points_rng, texture_rng, ripple_rng = rng.spawn(3)
     points = np.empty((CELLS, CELLS, 4), np.float32)
     points[..., :2] = points_rng.standard_normal((CELLS, CELLS, 2), np.float32) * np.float32(np.sqrt(0.5))
     points[..., 2:] = points_rng.random((CELLS, CELLS, 2), np.float32)
     strength = np.ones((CELLS, CELLS))
     if texture_shape is not None:
-        frequency = np.fft.fftfreq(CELLS, CELL_M), np.fft.rfftfreq(CELLS, CELL_M)
-        smoothing = np.exp(-((np.pi * TEXTURE_M) ** 2) * np.add.outer(frequency[0] ** 2, frequency[1] ** 2) / 2)
-        field = np.fft.irfft2(smoothing * np.fft.rfft2(texture_rng.standard_normal((CELLS, CELLS))), (CELLS, CELLS))
         quantiles = np.linspace(-6, 6, 2001)
         levels = stats.gamma.ppf(stats.norm.cdf(quantiles), texture_shape, scale=1 / texture_shape)
-        strength = np.interp(field / field.std(), quantiles, levels)
+        strength = np.interp(smooth_field(texture_length_m, texture_rng), quantiles, levels)
     if joints:
         middle_m = (np.arange(CELLS) + 0.5) * CELL_M
         on_line = (middle_m + JOINT_WIDTH_M / 2) % JOINT_SPACING_M < JOINT_WIDTH_M
         on_joint = on_line[:, None] | on_line[None, :]
         strength = np.where(on_joint, strength * 10 ** (JOINT_DB / 10), strength)
-    return Scatterers(points, np.sqrt(strength).astype(np.float32))
+    is_even = ripple_height_m == 0
+    relief_m = None if is_even else ripples(ripple_length_m, ripple_height_m, ripple_rng).astype(np.float32)
+    return Scatterers(points, np.sqrt(strength).astype(np.float32), relief_m)
 
 
 Shape = Callable[[Floats, Floats], tuple[Floats, Floats]]
@@ -116,10 +146,13 @@ def place(
     return SeabedObject(id_, kind, position_m, yaw_rad, extent_m, radius_m, row, column, amplitude, relief)
 
 
-def place_landmark(design: LandmarkDesign, position_m: Floats, yaw_rad: float, floor_z_m: float) -> SeabedObject:
+def place_landmark(
+    design: LandmarkDesign, position_m: Floats, yaw_rad: float, floor_z_m: float, foam_height_m: float = 0.0
+) -> SeabedObject:
     """Put a landmark on the floor, with its face at its true position (m, world) and a yaw in rad.
 
-    The floor rises or falls around it by a smooth cosine as far as that needs.
+    The floor rises or falls around it by a smooth cosine as far as that needs. Parts darker than the floor lie lower
+    than the others by ``foam_height_m``, at most on the floor.
     """
     bottom_m = float(position_m[2]) - design.height_m - floor_z_m
     pixels = len(design.mask)
@@ -131,7 +164,8 @@ def place_landmark(design: LandmarkDesign, position_m: Floats, yaw_rad: float, f
         level_db = design.level_db(x_m, y_m)
         away = np.clip((np.hypot(x_m, y_m) - plate_m) / SLOPE_M, 0, 1)
         ground_m = bottom_m * 0.5 * (1 + np.cos(np.pi * away))
-        return level_db, ground_m + np.where(np.isnan(level_db), 0.0, design.height_m)
+        height_m = np.where(level_db > 0, design.height_m, max(design.height_m - foam_height_m, 0.0))
+        return level_db, ground_m + np.where(np.isnan(level_db), 0.0, height_m)
 
     return place(design.id, design.name, shape, plate_m, position_m, yaw_rad, SLOPE_M)
 
