@@ -135,7 +135,9 @@ def descended(
     stacked = StackedGraph(graph)
     values, error = initial, stacked.error(initial)
     damping, ordering, tried, in_parts = FIRST_DAMPING, None, 0, 0
-    priors = [prior_of(key, 1 / HELD) for key in held]
+    priors, still = [prior_of(key, 1 / HELD) for key in held], gtsam.VectorValues()
+    for key in held:
+        still.insert(key, np.zeros(tangent_size(key)))
     while tried < most_steps:
         linear = stacked.linearize(values)
         for prior in priors:
@@ -147,6 +149,7 @@ def descended(
             tried += 1
             try:
                 step = damped_step(linear, values, damping, ordering)
+                step.update(still)  # doubled again and again the least move would add up
                 candidate = values.retract(step)
                 candidate_error = stacked.error(candidate)
             except RuntimeError:  # GTSAM: indeterminate for this damping
