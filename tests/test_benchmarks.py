@@ -78,6 +78,7 @@ QUICK = {
     "validation/mems_vehicle.py": Quick(  # on a short run the noise of the gyros hides little of an unbiased heading
         TWO_WORKERS, ("drawn_isam2_heading_nees", "worst_ratio", "passed"),
         ascending=((10, "drawn_ekf-slam_heading_nees"),)),
+    "validation/recognition_scenes.py": Quick(("--workers", "1", "--cases", "0 dB; hard"), ("cases", "passed")),
     "validation/batch_gate.py": Quick(
         ("--workers", "1"), ("told_power_median", "power_20_percent_20_seeds", "false_alarms_allowed", "passed"),
         ascending=((0, "power_50_percent_3_seeds"),)),
@@ -295,6 +296,62 @@ def test_fairness_has_a_row_for_each_choice_and_tells_some_apart():
         for name in ("default", told)
     ]
     assert len({row["causal.ate_se2_m"] for row in rows}) >= 3
+
+
+@pytest.fixture
+def scenes(monkeypatch) -> Any:
+    for folder in (BENCHMARKS, BENCHMARKS / "validation"):
+        monkeypatch.syspath_prepend(str(folder))
+    return importlib.import_module("recognition_scenes")
+
+
+def a_run(rows: list[tuple[int, int, int, float, int]]) -> Any:
+    """Passes of landmark 1, landmark 2, a weed and a lid, one after the other.
+
+    Of each detection: second, track, name (0: none), probability, and what truly lies there.
+    """
+    kept = importlib.import_module("recognition_runs")
+    begin_s = np.array([0.0, 100.0, 200.0, 300.0])
+    passes = kept.Passes(
+        np.array([1, 2, -1, -2]), np.array(["disc", "square", "weed", "lid"]), begin_s, begin_s + 50, np.full(4, 50)
+    )
+    second, track, named, probability, label = (np.array(column) for column in zip(*rows, strict=True))
+    error = np.tile([0.01, 0.0], (len(rows), 1))
+    covariance = np.tile(np.eye(2), (len(rows), 1, 1))
+    is_named = named > 0
+    confidence = np.where(is_named, probability, 0.8)
+    return kept.Run(
+        passes,
+        {"r": kept.Detections(second, track, named, probability, confidence, is_named, label, error, covariance)},
+    )
+
+
+def test_scenes_count_passes_of_landmarks_and_of_each_group_of_strangers_and_judge_a_track_by_its_end(scenes):
+    unjudged = importlib.import_module("recognition_runs").UNJUDGED
+    run = a_run([
+        (10, 1, 2, 0.90, 1), (20, 1, 1, 0.995, 1),  # wrong at first, right at its end
+        (110, 2, 2, 0.40, 2), (120, 2, 0, 0.0, 2),  # never accepted; ends as none: wrong
+        (210, 3, 0, 0.0, -1),  # a weed, refused
+        (310, 4, 2, 0.995, -2),  # a lid, taken for a landmark
+        (400, 5, 1, 0.60, unjudged),  # between things: accepted, not right, no track to judge
+    ])  # fmt: skip
+    found = scenes.summary([run, run], "r")
+    counted = {name: (found[name]["hits"], found[name]["passes"]) for name in ("recognised", "natural", "look_alikes")}
+    assert counted == {"recognised": (2, 4), "natural": (0, 2), "look_alikes": (2, 2)}
+    assert (found["accepted"], found["right"]) == (8, 0.25)
+    assert (found["tracks"], found["wrong_above_99"]) == (8, (2, 4))
+    assert found["range_bias_m"] == pytest.approx(0.01)
+    assert not scenes.reaches("hard", found)
+    fine = {name: {"hits": 19, "passes": 20} for name in ("recognised",)}
+    fine |= {name: {"hits": 0, "passes": 20} for name in ("natural", "look_alikes")} | {"ece_of_tracks": 0.01}
+    assert scenes.reaches("0 dB", fine)
+    assert not scenes.reaches("0 dB", fine | {"recognised": {"hits": 18, "passes": 20}})
+    assert scenes.reaches("-4.5 dB", fine | {"recognised": {"hits": 18, "passes": 20}})
+
+
+def test_wilsons_interval_is_the_published_one(scenes):
+    assert scenes.wilson(81, 263) == pytest.approx((0.2553, 0.3662), abs=1e-4)  # Newcombe 1998, table I
+    assert scenes.wilson(0, 20) == pytest.approx((0.0, 0.1611), abs=1e-4)
 
 
 FIGURES = ("smoothed", "causal", "landmarks", "time_s")

@@ -93,7 +93,7 @@ def digest() -> str:
     here = [Path(__file__).with_name(name) for name in ("recognition_runs.py", "brighter_landmarks.toml")]
     files = [*sorted(root.glob("*.*")), *here]
     for folder in ("sonar", "simulation", "navigation", "evaluation"):
-        files += sorted(path for path in (root / folder).glob("*.*") if path.suffix in {".py", ".json", ".toml"})
+        files += sorted(path for path in (root / folder).rglob("*.*") if path.suffix in {".py", ".json", ".toml"})
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:12]
 
 

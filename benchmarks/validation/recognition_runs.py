@@ -32,6 +32,8 @@ class Detections:
     """Detections of one rule with the truth about them; n of them."""
 
     stamp_s: np.ndarray
+    track: np.ndarray
+    """Track of each; negative: none."""
     named: np.ndarray
     """Most probable landmark."""
     probability: np.ndarray
@@ -53,6 +55,8 @@ class Passes:
     """Stretches in which an object is in view; m of them."""
 
     object_id: np.ndarray
+    kind: np.ndarray
+    """What the object is: a landmark's design, or the name of another thing."""
     begin_s: np.ndarray
     end_s: np.ndarray
     frames: np.ndarray
@@ -83,9 +87,9 @@ def run_basin(options: BasinOptions, rules: Sequence[str]) -> Run:
         for rule in rules
     }
     seconds, in_view, found = [], [], {rule: [] for rule in rules}
-    ids = np.empty(0, dtype=np.int64)
+    ids, kinds = np.empty(0, dtype=np.int64), ()
     for block in simulate_basin_frames(options):
-        ids = block.truth.ids
+        ids, kinds = block.truth.ids, block.truth.kinds
         block_s = (block.frames.stamps_ns - sequence.start_ns) * 1e-9
         seconds.append(block_s)
         in_view.append(block.truth.share_in_view >= WHOLE)
@@ -93,19 +97,20 @@ def run_basin(options: BasinOptions, rules: Sequence[str]) -> Run:
             for rule, session in sessions.items():
                 if (reported := session.take(frame)) is not None:
                     found[rule].append(_judged(reported, float(block_s[row]), block.truth, row))
-    passes = passes_of(np.concatenate(seconds), np.concatenate(in_view), ids)
+    passes = passes_of(np.concatenate(seconds), np.concatenate(in_view), ids, kinds)
     return Run(passes, {rule: _stacked(parts) for rule, parts in found.items()})
 
 
-def passes_of(seconds: np.ndarray, in_view: np.ndarray, ids: np.ndarray) -> Passes:
-    """From which objects, shape (m,), are in view in which frames, shape (n, m)."""
+def passes_of(seconds: np.ndarray, in_view: np.ndarray, ids: np.ndarray, kinds: Sequence[str]) -> Passes:
+    """From which objects, m of them, are in view in which frames, shape (n, m)."""
     rows = []
     for column, object_id in enumerate(ids.tolist()):
         seen_s = seconds[in_view[:, column]]
         stretches = np.split(seen_s, np.flatnonzero(np.diff(seen_s) > GAP_S) + 1)
-        rows += [(object_id, s[0], s[-1], len(s)) for s in stretches if len(s) >= LEAST_FRAMES]
-    columns = np.array(rows, dtype=float).reshape(-1, 4).T
-    return Passes(columns[0].astype(int), columns[1], columns[2], columns[3].astype(int))
+        rows += [(object_id, column, s[0], s[-1], len(s)) for s in stretches if len(s) >= LEAST_FRAMES]
+    columns = np.array(rows, dtype=float).reshape(-1, 5).T
+    kind = np.array(kinds)[columns[1].astype(int)]
+    return Passes(columns[0].astype(int), kind, columns[2], columns[3], columns[4].astype(int))
 
 
 def _judged(found: LandmarkDetections, stamp_s: float, truth: FrameTruth, row: int) -> Detections:
@@ -123,6 +128,7 @@ def _judged(found: LandmarkDetections, stamp_s: float, truth: FrameTruth, row: i
     confidence, most_probable = confidences(found)
     return Detections(
         np.full(len(found), stamp_s),
+        found.track,
         named,
         probability,
         confidence,
