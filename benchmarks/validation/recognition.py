@@ -19,7 +19,8 @@ of at least one half. It is right when that landmark truly lies within 15 cm.
 
 The same basins once more by the equations of 2014 (with our unknown class, assignment and tracks); and, on short basins
 that differ in nothing else: with speckle drawn anew in every frame, without multipath, with beams that the log says are
-equally spaced, with landmarks 3 dB brighter than their designs, and with a sound speed that is 1 % off.
+equally spaced, with landmarks 3 dB brighter than their designs, with a sound speed that is 1 % off, and with windows
+whose bins are wider than the cells in which appearances are compared.
 """
 
 import hashlib
@@ -53,6 +54,9 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "equally spaced beams": {"measured_lens": False},
     "landmarks 3 dB brighter": {"designs": str(Path(__file__).with_name("brighter_landmarks.toml"))},
     "sound speed 1 % off": {"sound_speed_error": 0.01},
+    "window of 7 m": {"window_m": 7.0},
+    "window of 9 m": {"window_m": 9.0},
+    "window of 10 m": {"window_m": 10.0},
 }
 TARGETS = {
     "passes_recognised": (0.95, 1.0),

@@ -78,6 +78,8 @@ def select_candidates(
     smoothing, neighbourhood, closing = (
         odd_counts(length_m, cell_m) for length_m in (params.smoothing_m, params.background_m, params.closing_m)
     )
+    smoothing, wide = np.maximum(smoothing, LEAST_COUNT).tolist(), np.maximum(closing, LEAST_COUNT).tolist()
+    closing = wide if params.closing_m > 0 else closing
     smooth = np.asarray(cv2.blur(image_db, smoothing[::-1], borderType=cv2.BORDER_REFLECT_101), dtype=np.float32)
     level_db, spread_db = background_of(smooth, smoothing, neighbourhood)
     contrast = smooth - _at_pixels(level_db, shape)
@@ -160,6 +162,9 @@ def false_alarm_offsets_db(spreads_db: Floats32, false_alarm: float) -> Floats32
     return np.interp(spreads_db, *offset_table(false_alarm)).astype(np.float32)
 
 
+LEAST_COUNT = 3
+"""Least beams and bins of smoothing and closing, where a long window has fewer in that length: speckle of one look
+would raise the threshold over an object, and break it into pieces."""
 CELL_M = 0.005
 """Grid on which designs are checked."""
 

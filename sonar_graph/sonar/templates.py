@@ -148,11 +148,12 @@ def sample_floor(
 ) -> None:  # fmt: skip
     """Fill in levels on a square grid of the floor, and 1 where a point is in the image, shapes (side, side).
 
-    Each is the mean of decibels over the range that a cell covers, linear between beams. R is ``level_R_sonar``.
+    Each is the mean of decibels over the bins whose middles a cell covers, or where cells are finer than bins, linear
+    between the two nearest; linear between beams. R is ``level_R_sonar``.
     """
     (beams, bins), side = image_db.shape, len(level)
     half_bins = 0.5 * cell_m / grid.bin_m
-    half = 0.5 * (side - 1)
+    is_fine, half = half_bins < 0.5, 0.5 * (side - 1)
     for i in range(side):
         for j in range(side):
             x, y, z = centre[0] + cell_m * (i - half), centre[1] + cell_m * (j - half), -height_m
@@ -168,13 +169,18 @@ def sample_floor(
             k = int(place)
             beam = grid.beam_of_azimuth[k] + (place - k) * (grid.beam_of_azimuth[k + 1] - grid.beam_of_azimuth[k])
             middle = (distance - grid.first_range_m) / grid.bin_m
-            first, last = math.floor(middle - half_bins + 1), math.floor(middle + half_bins)
+            if is_fine:
+                first, last = math.floor(middle), math.floor(middle) + 1
+            else:
+                first, last = math.floor(middle - half_bins + 1), math.floor(middle + half_bins)
             if beam < 0 or beam > beams - 1 or first < 0 or last >= bins:
                 continue
             b = min(int(beam), beams - 2)
             share = beam - b
-            total = 0.0
+            total, weights = 0.0, 0.0
             for n in range(first, last + 1):
-                total += (1 - share) * image_db[b, n] + share * image_db[b + 1, n]
-            level[i, j] = total / (last - first + 1)
+                weight = 1 - abs(n - middle) if is_fine else 1.0
+                total += weight * ((1 - share) * image_db[b, n] + share * image_db[b + 1, n])
+                weights += weight
+            level[i, j] = total / weights
             seen[i, j] = 1.0

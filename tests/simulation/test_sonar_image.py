@@ -319,6 +319,17 @@ def test_every_sonar_makes_images_of_its_own_size_and_its_log_says_what_their_co
         assert (said.scale, said.decibel_span, said.full_scale) == ("decibel", span, 255)
 
 
+def test_a_longer_window_has_as_many_bins_and_the_same_floor():
+    for window_m in (None, 5.0):
+        made = simulator(noise_db=15.0, window_m=window_m)
+        ranges_m = made.ranges_m()
+        assert len(ranges_m) == 512
+        assert np.ptp(ranges_m) == pytest.approx((window_m or 1.25) * 511 / 512)
+        near, far = bins_at(made, 1.8, 2.2)
+        power = np.mean([intensity(made, number=k)[40:56, near:far].mean() for k in range(2)])
+        assert 10 * np.log10(power) == pytest.approx(40, abs=1.5)
+
+
 @pytest.mark.parametrize("span", [80.0, 100.0])
 def test_counts_are_decibels_over_the_span(span: float):
     made = FrameSimulator(PLAIN, (), 0.0, 3, SONARS["didson"].model_copy(update={"decibel_span": span}))

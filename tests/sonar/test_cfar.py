@@ -84,6 +84,19 @@ def test_false_alarms_keep_their_rate_whatever_the_level_and_at_the_rim(level):
             assert rim.mean() > 0.2 * masks.mean()
 
 
+@pytest.mark.parametrize("window_m", [1.25, 7.0, 10.0])
+def test_an_object_is_one_candidate_whatever_the_window(window_m):
+    """A disc of 0.28 m, 12 dB over speckle of one look a bin, in the plane of the image."""
+    ranges_m = 1.26 + window_m / 512 * (np.arange(512) + 0.5)
+    r, a = np.meshgrid(ranges_m, AZIMUTHS_RAD)
+    disc = np.hypot(r * np.cos(a) - 1.9, r * np.sin(a)) < 0.14
+    for seed in range(5):
+        found = cfar.select_candidates(speckle_db(seed, 30.0 + 12.0 * disc), ranges_m, AZIMUTHS_RAD)
+        near = found.accepted[np.abs(found.range_m[found.accepted] - 1.9) < 0.1]
+        assert len(near) == 1
+        assert found.area_m2[near[0]] == pytest.approx(np.pi * 0.14**2, rel=0.5)
+
+
 def test_a_background_that_hardly_varies_makes_no_candidates():
     """Constant, or varying by its quantisation only."""
     steps = 30.0 + 0.05 * np.round(np.random.default_rng(2).uniform(0, 0.6, (96, 512)))

@@ -34,7 +34,7 @@ from sonar_graph.simulation.sonar_image.echoes import (
     Surface,
     Tables,
 )
-from sonar_graph.simulation.sonar_image.imaging_sonar import SONARS, ImageOptions, ImagingSonar
+from sonar_graph.simulation.sonar_image.imaging_sonar import ImageOptions, ImagingSonar
 from sonar_graph.simulation.sonar_image.scene import (
     CELL_M,
     CELLS,
@@ -80,7 +80,7 @@ class FrameSimulator:
         sonar: ImagingSonar | None = None,
     ) -> None:
         self.options = options
-        self.sonar = sonar or SONARS[options.sonar]
+        self.sonar = sonar or options.imaging_sonar()
         self.objects = list(objects)
         self._floor_z_m = floor_z_m
         self._seed = seed

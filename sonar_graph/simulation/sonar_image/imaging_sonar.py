@@ -128,6 +128,8 @@ class ImageOptions(SceneConditions):
 
     sonar: SonarName = "didson"
     """Sonar model; the window is the same for all."""
+    window_m: float | None = Field(None, ge=0.5, le=20)
+    """Length of the window in range; None: 1.25 m. It keeps its number of bins, and pulses are as many bins long."""
     designs: str | None = None
     """TOML file, or folder of such files, with the landmarks that lie in the basin. It needs four; of more, those with
     the four lowest identities lie there, in the order of their identities at (5, 0), (7, -5), (2, -7) and (0, -2).
@@ -167,3 +169,10 @@ class ImageOptions(SceneConditions):
     """Rounded stones on the route, up to 6 cm high."""
     decoys: int = Field(4, ge=0, le=6)
     """Flat rough patches on the route, as large as landmarks and as bright, of irregular outline."""
+
+    def imaging_sonar(self) -> ImagingSonar:
+        """The sonar with its window."""
+        sonar = SONARS[self.sonar]
+        length_m = self.window_m or sonar.range_length_m
+        resolution_m = sonar.range_resolution_m * length_m / sonar.range_length_m
+        return sonar.model_copy(update={"range_length_m": length_m, "range_resolution_m": resolution_m})
