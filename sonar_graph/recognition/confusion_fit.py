@@ -26,8 +26,8 @@ from sonar_graph.sonar import (
     ObjectSighting,
     Recogniser,
     RecogniserParams,
-    bounded_rows,
     mark_of,
+    posterior_mean_rows,
     soft_scores,
     virtual_evidence,
 )
@@ -191,14 +191,11 @@ def estimate_confusion(
             f"too few labelled frames ({'; '.join(poor)}; needed {LEAST_FRAMES} of each): give longer or more logs"
         )
     tracks = np.array([len(np.unique(fits.track[fits.label == k])) for k in range(len(counts))])
-    # (n + 1) / (n + 2) for the own class after n tracks (Platt 1999, section 2.2): classes that were never confused are
-    # not certain. All landmarks share the two fitted numbers, so that n counts the tracks of all of them.
-    n = np.append(np.full(len(tracks) - 1, tracks[:-1].sum()), tracks[-1])
-    targets = np.tile(1.0 / ((n + 2.0) * (len(n) - 1))[:, None], (1, len(n)))
-    np.fill_diagonal(targets, (n + 1.0) / (n + 2.0))
+    trials = np.append(np.full(len(ids), tracks[:-1].sum()), tracks[-1])  # landmarks share the two fitted numbers
+    targets = posterior_mean_rows(np.eye(len(counts)), trials)
     targets = targets[fits.label] / (counts[fits.label] * len(counts))[:, None]
-    sharpness, threshold = fit_scores(fits, targets, int(tracks.sum()))
-    matrix = mean_scores(soft_scores(fits.correlation, fits.visible, sharpness, threshold), fits.label)
+    sharpness, threshold = fit_scores(fits, targets, trials, int(tracks.sum()))
+    matrix = confusion_rows(soft_scores(fits.correlation, fits.visible, sharpness, threshold), fits.label, trials)
     sigmas = np.sqrt(np.nanmean((fits.range_azimuth_error * fits.visible[:, None] ** 2) ** 2, axis=0))
     return Confusion(
         ids=ids,
@@ -229,12 +226,16 @@ def error_correlation(fits: LabelledFits) -> float:
     return float(np.clip(np.mean(products / np.maximum(squares, np.finfo(float).tiny)), 0.0, MOST_CORRELATED))
 
 
-def mean_scores(scores: Floats, label: Ints) -> Floats:
-    """Confusion matrix from soft scores, no entry below the least, rows with sum 1."""
-    return bounded_rows(np.array([scores[label == k].mean(axis=0) for k in range(scores.shape[1])]))
+def confusion_rows(scores: Floats, label: Ints, trials: Ints) -> Floats:
+    """Confusion matrix from the soft scores of frames, for classes with these numbers of trials.
+
+    Frames of a track repeat each other, so that tracks are the trials, not frames.
+    """
+    means = np.array([scores[label == k].mean(axis=0) for k in range(scores.shape[1])])
+    return posterior_mean_rows(means, trials)
 
 
-def fit_scores(fits: LabelledFits, targets: Floats, tracks: int) -> tuple[float, float]:
+def fit_scores(fits: LabelledFits, targets: Floats, trials: Ints, tracks: int) -> tuple[float, float]:
     """Sharpness and threshold for which the posterior of one frame fits weighted targets, shape (n, classes).
 
     The posterior counts, after the confusion matrix and from equal priors: doubt in the scores would count twice.
@@ -246,7 +247,7 @@ def fit_scores(fits: LabelledFits, targets: Floats, tracks: int) -> tuple[float,
 
     def loss(log_sharpness: float, logit: float) -> float:
         scores = soft_scores(fits.correlation, fits.visible, float(np.exp(log_sharpness)), float(expit(logit)))
-        matrix = mean_scores(scores, fits.label)
+        matrix = confusion_rows(scores, fits.label, trials)
         posterior = virtual_evidence(equal, scores, matrix, matrix.mean(axis=0), news)
         return float(-np.sum(targets * np.log(np.maximum(posterior, 1e-12))))
 

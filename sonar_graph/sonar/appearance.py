@@ -2,7 +2,8 @@
 
 The image is sampled on a square grid of the floor, where foreshortening and the shape of the fan drop out. Designs are
 templates on the same grid (`sonar_graph.sonar.templates`). The correlation c over the cells in view does not depend on
-gain or on the level of the floor. Derivation: docs/theory/recognition.md.
+gain or on the level of the floor. How far speckle lowers it depends on the design's contrast and on the bins, and is
+corrected. Derivation: docs/theory/recognition.md.
 """
 
 import math
@@ -17,7 +18,7 @@ from sonar_graph.devices import LandmarkDesign
 from sonar_graph.images import SonarFrames
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.numerics import compiled
-from sonar_graph.sonar.confusion import Confusion, soft_scores
+from sonar_graph.sonar.confusion import STANDARD_ATTENUATION, Confusion, soft_scores
 from sonar_graph.sonar.geometry import FloorView
 from sonar_graph.sonar.regions import Candidates
 from sonar_graph.sonar.templates import Floats32, Patch, PolarGrid, Templates
@@ -48,7 +49,8 @@ class DesignFit:
     """Fit of each design to a patch."""
 
     correlation: Floats
-    """Best over headings and shifts, shape (designs,); -1 where too little is visible."""
+    """Best over headings and shifts, shape (designs,); negative where too little is visible. That of a sighting is
+    corrected for attenuation by speckle, and may exceed 1."""
     visible: float
     """Share of the cells in view at the best fit of all."""
     best: int
@@ -76,6 +78,8 @@ class Appearance:
         self._pictures, self._squares = np.ascontiguousarray(pictures.T), np.ascontiguousarray(pictures.T**2)
         self._sums = self._pictures.sum(axis=0), self._squares.sum(axis=0)
         self._first_of_design = np.searchsorted(self.templates.design, np.arange(self.designs))
+        self._variance_db2 = np.add.reduceat(pictures.var(axis=1), self._first_of_design)
+        self._variance_db2 /= np.bincount(self.templates.design)
 
     def fit(self, patch: Patch) -> DesignFit:
         """Fit of the designs at their best headings and shifts."""
@@ -96,6 +100,13 @@ class Appearance:
             float(self.templates.heading_rad[best_template]),
             patch.centre_m + self.params.cell_m * (self._shifts[best_shift] - self._steps + offset),
         )
+
+    def attenuation(self, bin_m: float) -> Floats:
+        """Correlation of a patch with its own design that speckle leaves, shape (designs,), in bins of a length.
+
+        A template of variance V plus noise of variance N correlates with the template by ``sqrt(V / (V + N))``.
+        """
+        return np.asarray(np.sqrt(self._variance_db2 / (self._variance_db2 + noise_db2(self.params.cell_m, bin_m))))
 
     def _correlations(self, patch: Patch, seen: Floats32, visible: Floats32) -> Floats32:
         """Correlation of each shift with each template, shape (shifts, templates); -1 where too little is visible."""
@@ -148,6 +159,20 @@ def parabola_top(values: Floats32, at: int) -> float:
     return 0.5 * (before - after) / bend if bend < 0 else 0.0
 
 
+ONE_LOOK_DB2 = (10 / math.log(10)) ** 2 * math.pi**2 / 6
+"""Variance of the level of speckle of one look."""
+BINS_A_LOOK = 1.64
+"""Length of a pulse: 4 mm in bins of 2.44 mm."""
+TEXTURE_DB2 = 6.7
+"""Variance of a cell that looks do not average out. Measured on a simulated basin: what the shipped designs leave
+unexplained in their own patches (15.0), without its speckle."""
+
+
+def noise_db2(cell_m: float, bin_m: float) -> float:
+    """Variance of the level of a cell that shows an even floor, dB squared."""
+    return ONE_LOOK_DB2 / max(1.0, cell_m / (BINS_A_LOOK * bin_m)) + TEXTURE_DB2
+
+
 CENTROID_SIGMA_M = 0.04
 """Standard deviation of a candidate's centroid from the landmark's centre, along and across; used without a fit."""
 SLANT_PLANE = FloorView(np.eye(3), 1e-3)
@@ -175,6 +200,7 @@ class CandidateFit:
         self._appearance, self._confusion = appearance, confusion
         self._aperture_rad = elevation_aperture_rad
         self._grid: PolarGrid | None = None
+        self._correction = np.ones(appearance.designs)
         self._shape: tuple[Floats, Floats] = np.empty(0), np.empty(0)
 
     def at(
@@ -185,6 +211,7 @@ class CandidateFit:
         is_same = (one is other or np.array_equal(one, other) for one, other in zip(self._shape, shape, strict=True))
         if self._grid is None or not all(is_same):
             self._grid, self._shape = PolarGrid.of(*shape, self._aperture_rad), shape
+            self._correction = STANDARD_ATTENUATION / self._appearance.attenuation(self._grid.bin_m)
         view, appearance = view or SLANT_PLANE, self._appearance
         sightings: list[ObjectSighting | None] = []
         for row in rows.tolist():
@@ -198,6 +225,7 @@ class CandidateFit:
             if centre is not None:
                 side, cell_m = appearance.patch_side, appearance.params.cell_m
                 fit = appearance.fit(self._grid.patch(image_db, view, centre, side, cell_m))
+                fit = replace(fit, correlation=fit.correlation * self._correction)
                 best = fit.correlation.max()
                 if best >= self._confusion.threshold:
                     covariance = self._confusion.range_azimuth_cov(fit.visible)

@@ -1,8 +1,8 @@
 """Measured model of recognition: soft scores of the features, and how often each landmark shows each feature.
 
-Classes and features are the designs in their order, last "none". ``matrix[k, j] = p(z = j | x = k)`` is the mean soft
-score of feature j over the labelled frames of class k. With c_j the correlation of design j with the patch and
-``visible`` the share of its cells in the image (docs/theory/recognition.md)::
+Classes and features are the designs in their order, last "none". ``matrix[k, j] = p(z = j | x = k)`` is the posterior
+mean of the score of feature j given class k (`posterior_mean_rows`). With c_j the corrected correlation of design j
+with the patch and ``visible`` the share of its cells in the image (docs/theory/recognition.md)::
 
     s_j     ~  (1 - max(c_j, 0)^2)^(-sharpness visible)
     s_none  ~  (1 - threshold^2)^(-sharpness visible)
@@ -25,13 +25,20 @@ from sonar_graph.calibration import Section
 from sonar_graph.devices import LandmarkDesign
 from sonar_graph.errors import CalibrationError
 from sonar_graph.files import text_of
-from sonar_graph.measurements import Floats
+from sonar_graph.measurements import Floats, Ints
 from sonar_graph.settings import faults_in
 
 BEST_CORRELATION = 0.999
 """Upper limit of correlations, which keeps the scores finite."""
-LEAST_ENTRY = 1e-3
-"""Smallest entry of the matrix: what was never seen in some hundred frames is still possible."""
+JEFFREYS = 0.5
+"""Prior count of each feature."""
+STANDARD_ATTENUATION = 0.896
+"""Correlation of the shipped designs with their own patches that speckle leaves, in the window that ships: their mean.
+Correlations are corrected to it (`sonar_graph.sonar.appearance`)."""
+TRACK_SPREAD = 0.0135
+"""Standard deviation of the median corrected correlation of a landmark's track: 8 tracks of the shipped designs."""
+UNMEASURED_THRESHOLD = STANDARD_ATTENUATION - 3 * TRACK_SPREAD
+"""For designs that were never measured: fits worse than those of a landmark's tracks are of something else."""
 ASSUMED_RIGHT = 0.9
 """Share of frames in which an unmeasured landmark is assumed to show its own feature."""
 
@@ -68,7 +75,7 @@ class Confusion(Section):
     sharpness: float = Field(gt=0)
     """Exponent of the scores; half the effective number of independent samples in a patch."""
     threshold: float = Field(gt=0, lt=1)
-    """Correlation at which "none of them" is as probable as a design."""
+    """Corrected correlation at which "none of them" is as probable as a design."""
     range_sigma_m: float = Field(gt=0)
     """Standard deviation of the range in a frame that shows the whole landmark."""
     azimuth_sigma_rad: float = Field(gt=0)
@@ -88,6 +95,10 @@ class Confusion(Section):
             raise ValueError(f"matrix: expected {classes} rows of {classes} for {len(self.ids)} ids and none of them")
         if (matrix < 0).any() or not np.allclose(matrix.sum(axis=1), 1, atol=1e-6):
             raise ValueError("matrix: each row must be probabilities that sum to 1 (rows are the true classes)")
+        if (matrix == 0).any():
+            raise ValueError(
+                "matrix: an entry is 0; what was never seen in n tracks may still happen: give about 1 / 2n"
+            )
         return self
 
     def check_designs(self, designs: Sequence[LandmarkDesign], source: str = "confusion") -> None:
@@ -111,8 +122,8 @@ class Confusion(Section):
                 )
 
     def array(self) -> Floats:
-        """The matrix, no entry below 0.001, rows with sum 1."""
-        return bounded_rows(np.array(self.matrix))
+        """The matrix, shape (ids + 1, ids + 1)."""
+        return np.array(self.matrix)
 
     def range_azimuth_cov(self, visible: float) -> Floats:
         """Covariance of range and azimuth of a landmark with this share in view, shape (2, 2).
@@ -134,10 +145,14 @@ class Confusion(Section):
         return np.asarray(self.array().mean(axis=0))
 
 
-def bounded_rows(matrix: Floats) -> Floats:
-    """Rows with no entry below 0.001 and the sum 1."""
-    matrix = np.maximum(matrix, LEAST_ENTRY)
-    return np.asarray(matrix / matrix.sum(axis=1, keepdims=True))
+def posterior_mean_rows(mean_scores: Floats, trials: Ints) -> Floats:
+    """Posterior mean of each row of a confusion matrix, shape (classes, features), under Jeffreys' Dirichlet prior.
+
+    ``C[k, j] = (n_k m_kj + 1/2) / (n_k + features / 2)`` with the mean scores m of n_k independent trials of class k: a
+    confusion that never happened in n trials keeps about 1 / 2n.
+    """
+    n = trials[:, None]
+    return np.asarray((n * mean_scores + JEFFREYS) / (n + JEFFREYS * mean_scores.shape[1]))
 
 
 def mark_of(design: LandmarkDesign) -> DesignMark:
@@ -180,6 +195,10 @@ def confusion_for(designs: Sequence[LandmarkDesign]) -> Confusion:
             "ids": ids,
             "designs": marks,
             "matrix": tuple(map(tuple, matrix.tolist())),
-            "provenance": {"origin": f"assumed: {ASSUMED_RIGHT:.0%} right; measure it with sonar-graph calibrate"},
+            "threshold": UNMEASURED_THRESHOLD,
+            "provenance": {
+                "origin": f"assumed: {ASSUMED_RIGHT:.0%} right, threshold derived from the contrast of the designs; "
+                "measure it with sonar-graph calibrate"
+            },
         }
     )

@@ -1,14 +1,25 @@
 """Laws of templates, of patches of the floor, of the fit of designs to them, and of the sightings that follow."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 from scipy.special import erf
 
 from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.images import SonarFrames
 from sonar_graph.measurements import Floats
-from sonar_graph.sonar.appearance import CENTROID_SIGMA_M, Appearance, CandidateFit, DesignFit, ObjectSighting
-from sonar_graph.sonar.confusion import Confusion, confusion_for, soft_scores
+from sonar_graph.sonar.appearance import (
+    CENTROID_SIGMA_M,
+    Appearance,
+    CandidateFit,
+    DesignFit,
+    ObjectSighting,
+    noise_db2,
+)
+from sonar_graph.sonar.confusion import STANDARD_ATTENUATION, Confusion, confusion_for, soft_scores
 from sonar_graph.sonar.geometry import FloorView
 from sonar_graph.sonar.templates import Patch, PolarGrid, Templates, material_radius_m
 
@@ -115,6 +126,43 @@ def test_a_point_is_seen_when_all_bins_of_its_cell_are_in_the_image():
         np.testing.assert_allclose(patch.level_db, patch.seen, atol=1e-6)
 
 
+@given(st.floats(2.0, 15.0), st.integers(128, 1024))
+@example(10.0, 512)
+@example(15.0, 128)
+@example(0.015 * 512, 512)
+def test_a_patch_has_a_value_wherever_the_image_has_data_whatever_the_window(window_m: float, bins: int):
+    """A constant image gives a constant patch, and an image of its ranges the range of each cell."""
+    cell_m, bin_m = 0.015, window_m / bins
+    ranges_m = 0.7 + bin_m * (np.arange(bins) + 0.5)
+    grid, (x, y) = PolarGrid.of(ranges_m, AZIMUTHS_RAD), 1.75 + cell_m * (np.mgrid[:41, :41] - 20.0)
+    r = np.sqrt(x**2 + (y - 1.75) ** 2 + HEIGHT_M**2)
+    flat, sloped = (
+        grid.patch(np.tile(level, (96, 1)).astype(np.float32), VIEW, np.array([1.75, 0.0]), 41, cell_m)
+        for level in (np.full(bins, 37.0), 100 * ranges_m)
+    )
+    np.testing.assert_array_equal(flat.seen, 1)
+    np.testing.assert_allclose(flat.level_db, 37.0, rtol=1e-6)
+    np.testing.assert_allclose(sloped.level_db / 100, r, atol=1e-5 if bin_m > cell_m else bin_m / 2 + 1e-5)
+
+
+@pytest.mark.parametrize("bin_m", [0.0024, 0.0149, 0.0151, 0.03])
+def test_what_lies_beyond_the_first_or_last_bin_is_not_seen(bin_m: float):
+    """Patches across the ends of a window: a cell reaches half of itself beyond a bin's middle, a finer one not."""
+    cell_m, end_m = 0.015, np.hypot(1.75, HEIGHT_M)
+    x, y = cell_m * (np.mgrid[:41, :41] - 20.0)
+    r, reach_m = np.sqrt((1.75 + x) ** 2 + y**2 + HEIGHT_M**2), 0.0 if bin_m > cell_m else cell_m / 2
+    for ranges_m in (end_m + bin_m * np.arange(-50, 1), end_m + bin_m * np.arange(51)):
+        image = np.ones((96, 51), np.float32)
+        patch = PolarGrid.of(ranges_m, AZIMUTHS_RAD).patch(image, VIEW, np.array([1.75, 0.0]), 41, cell_m)
+        inside = (r > ranges_m[0] + reach_m) & (r < ranges_m[-1] - reach_m)
+        outside = (r < ranges_m[0] - reach_m) | (r > ranges_m[-1] + reach_m)
+        assert inside.any()
+        assert outside.any()
+        np.testing.assert_array_equal(patch.seen[inside], 1)
+        np.testing.assert_array_equal(patch.seen[outside], 0)
+        np.testing.assert_array_equal(patch.level_db, patch.seen)
+
+
 @pytest.mark.parametrize("index", range(len(DEFAULT_DESIGNS)))
 @pytest.mark.parametrize("heading_rad", [0.3, 2.0, -2.6])
 def test_every_design_is_known_at_every_heading_in_speckle(appearance, index, heading_rad):
@@ -178,6 +226,38 @@ def test_the_rim_of_the_image_does_not_push_a_landmark_aside(appearance, design)
             np.testing.assert_allclose(fit.centre_m, (1.7, y_m), atol=0.003)
 
 
+def on_floor(design: LandmarkDesign) -> LandmarkDesign:
+    """Its bright figure without the plate."""
+    return replace(design, mask=np.where(design.mask > 0, design.mask, np.nan))
+
+
+@pytest.mark.parametrize("bin_m", [0.0024, 0.02])
+@pytest.mark.parametrize("designs", [DEFAULT_DESIGNS, tuple(map(on_floor, DEFAULT_DESIGNS))], ids=["plates", "bare"])
+def test_speckle_lowers_the_correlation_of_a_design_by_its_attenuation(designs, bin_m: float):
+    """A template in white noise, as strong as speckle in such bins."""
+    appearance, rng = Appearance(designs), np.random.default_rng(0)
+    templates, side = appearance.templates, appearance.patch_side
+    sigma_db, found = np.sqrt(noise_db2(appearance.params.cell_m, bin_m)), np.zeros((6, len(designs)))
+    for k in range(len(designs)):
+        picture = templates.pictures[templates.design == k][0]
+        for draw in found:
+            level = rng.normal(40.0, sigma_db, (side, side))
+            x, y = np.divmod(templates.cells, templates.side)
+            level[x + appearance._steps, y + appearance._steps] += picture
+            draw[k] = appearance.fit(
+                Patch(level.astype(np.float32), np.ones((side, side), np.float32), np.zeros(2))
+            ).correlation[k]
+    np.testing.assert_allclose(found.mean(axis=0), appearance.attenuation(bin_m), atol=0.02)
+
+
+def test_a_window_of_long_bins_and_a_design_of_low_contrast_attenuate_more():
+    bare, plates = Appearance(tuple(map(on_floor, DEFAULT_DESIGNS))), Appearance(DEFAULT_DESIGNS)
+    assert plates.attenuation(0.00244).mean() == pytest.approx(STANDARD_ATTENUATION, abs=1e-3)
+    assert (bare.attenuation(0.00244) < plates.attenuation(0.00244) - 0.05).all()
+    assert (plates.attenuation(0.0137) < plates.attenuation(0.00244) - 0.05).all()
+    assert (plates.attenuation(0.0137) == plates.attenuation(0.02)).all(), "both show one look a cell"
+
+
 APERTURE_RAD = 0.244
 SETTINGS = {"threshold": 0.7, "range_sigma_m": 0.01, "azimuth_sigma_rad": 0.004}
 MODEL = confusion_for(DEFAULT_DESIGNS).model_copy(update=SETTINGS)
@@ -217,6 +297,14 @@ def test_range_and_azimuth_are_those_of_the_centre_and_less_certain_where_partly
     assert found.is_fitted
     assert 0.8 <= found.fit.visible < 0.97
     np.testing.assert_allclose(found.covariance, np.diag([0.01**2, 0.004**2]) / found.fit.visible**4)
+
+
+def test_correlations_of_a_sighting_are_corrected_for_speckle(appearance, triangle):
+    found = look_at(appearance, triangle, (1.7, 0.05))
+    centre = np.array(VIEW.floor_point(*VIEW.range_azimuth(np.array([1.7, 0.05]))))
+    raw = _fit(appearance, triangle, tuple(centre)).correlation
+    expected = raw * STANDARD_ATTENUATION / appearance.attenuation(RANGES_M[1] - RANGES_M[0])
+    np.testing.assert_allclose(found.fit.correlation, expected, rtol=1e-3)
 
 
 def test_what_no_design_fits_stays_where_its_centroid_is(appearance, triangle):

@@ -11,7 +11,14 @@ import pytest
 from sonar_graph.devices import landmark_designs
 from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign, load_designs
 from sonar_graph.errors import CalibrationError
-from sonar_graph.sonar.confusion import Confusion, confusion_for, mark_of, read_confusion, soft_scores
+from sonar_graph.sonar.confusion import (
+    Confusion,
+    confusion_for,
+    mark_of,
+    posterior_mean_rows,
+    read_confusion,
+    soft_scores,
+)
 
 RING = LandmarkDesign(9, "ring", 0.3, np.zeros((4, 4)))
 DESIGNS = [RING, replace(RING, id=10)]
@@ -32,10 +39,24 @@ def test_odds_of_scores_are_those_of_the_equation():
     assert np.isfinite(soft_scores(np.array([[1.0, 1.0]]), np.ones(1), 500.0, 0.8)).all()
 
 
-def test_the_matrix_has_no_zeros_and_the_base_is_its_mean():
-    found = model(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.2, 0.3, 0.5))).array()
-    np.testing.assert_allclose(found[[0, 2]], [np.array([1.0, 0.001, 0.001]) / 1.002, [0.2, 0.3, 0.5]])
+def test_the_base_is_the_mean_of_the_matrix():
+    np.testing.assert_allclose(model().array(), ROWS)
     np.testing.assert_allclose(model().base(), [0.5, 0.3, 0.2])
+
+
+def test_rows_are_the_means_of_their_dirichlet_posteriors():
+    """Half a count of each feature before n trials: uniform without trials, and never certain."""
+    rows = posterior_mean_rows(np.array([[1.0, 0.0, 0.0], [0.9, 0.1, 0.0], [0.2, 0.3, 0.5]]), np.array([0, 10, 10**9]))
+    np.testing.assert_allclose(rows[:2], [[1 / 3] * 3, np.array([9.5, 1.5, 0.5]) / 11.5])
+    np.testing.assert_allclose(rows[2], [0.2, 0.3, 0.5], atol=1e-8)
+
+
+def test_what_was_never_confused_in_the_shipped_model_is_bounded_by_its_tracks():
+    shipped = confusion_for(DEFAULT_DESIGNS)
+    landmarks = sum(int(shipped.provenance[f"tracks of landmark {k}"]) for k in shipped.ids)
+    none = int(shipped.provenance["tracks of no landmark"])
+    for row, trials in zip(shipped.array(), [landmarks] * 4 + [none], strict=True):
+        assert row.min() >= 0.5 / (trials + 2.5)
 
 
 @pytest.mark.parametrize(
@@ -45,6 +66,7 @@ def test_the_matrix_has_no_zeros_and_the_base_is_its_mean():
         ({"matrix": [[1.3, 0.1, 0.1], *ROWS[1:]]}, "each row must be probabilities"),
         ({"matrix": [[1.5, -0.5, 0.0], *ROWS[1:]]}, "each row must be probabilities"),
         ({"matrix": [[0.8, 0.2], *ROWS[1:]]}, "matrix: expected 3 rows of 3 for 2 ids"),
+        ({"matrix": [[0.9, 0.1, 0.0], *ROWS[1:]]}, "an entry is 0"),
         ({"designs": [{"name": "ring", "digest": ""}]}, "expected one for each of 2 ids, not 1"),
         ({"sharpness": -1.0}, "sharpness"),
         (None, "not JSON"),
@@ -79,6 +101,7 @@ def test_designs_that_ship_have_a_measured_model_and_others_an_assumed_one():
     other = confusion_for([RING])
     assert other.ids == (9,)
     assert "assumed" in other.provenance["origin"]
+    assert other.threshold == pytest.approx(0.856, abs=5e-4)
     np.testing.assert_allclose(other.array().sum(axis=1), 1)
     other.check_designs([RING])
 
