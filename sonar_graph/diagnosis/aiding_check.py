@@ -109,9 +109,10 @@ def displacements(right: Sequence, stamps_ns: Ints, places: Floats, yaw_rad: Flo
     """
     x, y, _ = right.calibration.dvl.mounting.pose().rotation().matrix() @ right.dvl.velocity.T
     velocity = (x + 1j * y) * np.exp(1j * yaw_rad)
-    path = np.cumsum((velocity[1:] + velocity[:-1]) / 2 * np.diff(right.dvl.stamps_ns) * 1e-9)
+    steps = (velocity[1:] + velocity[:-1]) / 2 * np.diff(right.dvl.stamps_ns) * 1e-9
+    path = np.concatenate([[0.0], np.cumsum(steps)])
     ends = np.arange(max(stamps_ns[0], right.start_ns), min(stamps_ns[-1], right.end_ns) + 1, WINDOW_NS)
-    reckoned = np.diff(np.interp(ends, right.dvl.stamps_ns[1:], path))
+    reckoned = np.diff(np.interp(ends, right.dvl.stamps_ns, path))
     return np.diff(np.interp(ends, stamps_ns, places[:, 0] + 1j * places[:, 1])), reckoned
 
 

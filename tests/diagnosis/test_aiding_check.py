@@ -85,6 +85,12 @@ def test_noise_of_fixes_of_a_slow_vehicle_is_no_unit_and_no_distance(every_s: fl
     assert not finding.acts, finding.text()
 
 
+@pytest.mark.parametrize("rows", [1, 2, 100])
+def test_a_doppler_log_of_one_row_or_a_few_tells_nothing_of_fixes(rows: int):
+    (finding,) = aiding_check.position_findings(fixed(replace(RIGHT, dvl=RIGHT.dvl.rows(slice(rows)))), NO_CONFIG)
+    assert finding.text() == "cannot be told: too few fixes beside the Doppler log"
+
+
 def test_fixes_in_a_map_grid_are_named_with_the_origin_that_brings_them_to_the_start():
     grid = np.array([500_000.0, 4_670_000.0, 0.0])
     config = LogConfig.parse({"positions": {"origin_m": [1.0, 2.0, 3.0]}}, "x")
