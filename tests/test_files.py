@@ -2,6 +2,7 @@
 
 import errno
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -106,6 +107,30 @@ def test_a_block_that_fails_changes_nothing_and_leaves_no_temporary_file(tmp_pat
         raise RuntimeError
     assert contents(tmp_path) == before
     assert not (tmp_path / "runs" / "new").exists()
+
+
+@pytest.mark.parametrize("is_new", [False, True])
+def test_a_file_that_is_interrupted_as_it_begins_or_later_leaves_nothing_not_even_its_folder(
+    tmp_path, monkeypatch, is_new
+):
+    """A signal has no better moment: the file is there, and who asked for it does not know yet."""
+    path, opened = tmp_path / "made" / "below" / "log.mcap", os.open
+    if not is_new:
+        path.parent.mkdir(parents=True)
+    before = list(tmp_path.rglob("*"))
+    with pytest.raises(KeyboardInterrupt), replacing(path):
+        raise KeyboardInterrupt
+    assert list(tmp_path.rglob("*")) == before
+
+    def interrupted(*given):
+        descriptor = opened(*given)
+        signal.raise_signal(signal.SIGINT)
+        return descriptor
+
+    monkeypatch.setattr("os.open", interrupted)
+    with pytest.raises(KeyboardInterrupt), replacing(path):
+        pytest.fail("it began")
+    assert list(tmp_path.rglob("*")) == before
 
 
 def test_killed_between_two_files_all_are_still_known_as_ours(tmp_path, monkeypatch):

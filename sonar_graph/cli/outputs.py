@@ -14,7 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from sonar_graph.cli.arguments import echo, printable
 from sonar_graph.errors import EvaluationError, LogError, SonarGraphError
-from sonar_graph.files import COMPARISON, folder_for_use, read_json, result_folder
+from sonar_graph.files import COMPARISON, read_json, result_folder
 
 
 def writable_log(path: Path, source: Path | None = None, *, overwrite: bool = False) -> Path:
@@ -104,9 +104,12 @@ def _is_replaceable(path: Path) -> bool:
 
 
 def _require_writing_in(folder: Path, path: Path, refusal: type[SonarGraphError]) -> None:
-    """Try to write to a folder, made for that if need be; an error names the path that was asked for."""
+    """Try to write to a folder, or where it would be made; an error names the path that was asked for.
+
+    Nothing is made for that: another command may be about to write there.
+    """
     try:
-        with folder_for_use(folder), TemporaryFile(dir=folder):
+        with TemporaryFile(dir=next(one for one in (folder, *folder.parents) if one.exists() or one.is_symlink())):
             pass
     except OSError as error:
         raise refusal(f"{path}: cannot be written: {error.strerror}; choose another place with -o") from error

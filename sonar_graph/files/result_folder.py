@@ -266,25 +266,26 @@ def replacing(path: Path) -> Iterator[Path]:
     )
     if folder is not None:
         folder.require([name])
-    if folder is None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    partial = _new_file(path) if folder is None else _new_file(folder.path / path.name, folder.token)
-    try:
+    place, token = (path, "") if folder is None else (folder.path / path.name, folder.token)
+    use = folder_for_use(path.parent) if folder is None else contextlib.nullcontext()
+    with use, _new_file(place, token) as partial:
         yield partial
         if folder is None:
             partial.replace(path)
         else:
             folder.stage(name, partial)
-    except BaseException:
-        partial.unlink(missing_ok=True)
-        raise
 
 
-def _new_file(path: Path, token: str = "") -> Path:
-    """An empty file beside a path, which nothing else has or links to."""
+@contextmanager
+def _new_file(path: Path, token: str = "") -> Iterator[Path]:
+    """Make an empty file beside a path, which nothing else has or links to; removed when the block fails."""
     partial = path.with_name(f".{path.name[:_LONGEST_NAME]}.{token}{secrets.token_hex(6)}.partial{path.suffix}")
-    os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
-    return partial
+    with contextlib.ExitStack() as failure:
+        with deferred_interrupt():
+            os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
+            failure.callback(partial.unlink, missing_ok=True)
+        yield partial
+        failure.pop_all()
 
 
 def write_manifest(folder: Path, kind: str, digests: dict[str, list[str]], unfinished: str = "") -> None:
@@ -292,14 +293,10 @@ def write_manifest(folder: Path, kind: str, digests: dict[str, list[str]], unfin
 
     ``unfinished`` is in the names of temporary files, as long as there may be some.
     """
-    partial = _new_file(folder / MANIFEST)
     content = {"format": FORMAT, "kind": kind, "files": digests} | ({"unfinished": unfinished} if unfinished else {})
-    try:
+    with _new_file(folder / MANIFEST) as partial:
         partial.write_text(json.dumps(content, indent=1) + "\n", "utf-8")
         partial.replace(folder / MANIFEST)
-    except BaseException:
-        partial.unlink(missing_ok=True)
-        raise
 
 
 def digest_of(path: Path) -> str:

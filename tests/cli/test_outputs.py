@@ -7,8 +7,8 @@ import pytest
 from mcap.writer import Writer
 
 from sonar_graph.cli.compare import names_written
-from sonar_graph.cli.outputs import writable_folder
-from sonar_graph.errors import EvaluationError
+from sonar_graph.cli.outputs import writable_folder, writable_log
+from sonar_graph.errors import EvaluationError, LogError
 from sonar_graph.files import LOCK, MANIFEST
 
 QUICK = ("--estimators", "dead-reckoning")
@@ -134,6 +134,19 @@ def test_a_refused_command_leaves_no_folder_that_it_made_and_every_one_that_was_
         assert {basin, unreadable, there} == set(tmp_path.iterdir())
         assert not list(there.iterdir())
     assert run("compare", basin, "-o", tmp_path / "made" / "below", *QUICK) == 0
+
+
+def test_to_look_whether_a_place_can_be_written_makes_no_folder_that_another_command_may_find(tmp_path, monkeypatch):
+    """Two commands begin at once in a new folder: neither removes it before the other has written to it."""
+    made = []
+    monkeypatch.setattr("os.mkdir", lambda path, *_: made.append(path))
+    assert writable_log(tmp_path / "new" / "below" / "log.mcap")
+    assert not made
+    (tmp_path / "words").write_text("words")
+    (tmp_path / "link").symlink_to("nowhere")
+    for place in ("words", "words/below", "link", "link/below"):
+        with pytest.raises(LogError, match=r"log\.mcap: cannot be written: (Not a directory|No such file)"):
+            writable_log(tmp_path / place / "log.mcap")
 
 
 OURS = ["recognised/1.jpg", "runs/dead-reckoning/result.json", "report.html", "comparison.json"]
