@@ -356,6 +356,7 @@ def test_a_gate_refuses_a_few_outliers_and_opens_when_most_are():
     assert pytest.approx(chi2.ppf(0.999, 2)) == OUTLYING
     assert outcomes(judge(gate, 1.0, 7) + judge(gate, 100.0, 8)) == [USED] * 7 + [GATED] * 5 + [LET_IN] * 3
     assert outcomes(judge(gate, 1.0, 5) + judge(gate, 100.0)) == [USED] * 5 + [GATED]
+    assert outcomes(judge(gate, math.nan)) == [GATED]  # no distance
     always = Gate.of(0.99, 0.0)  # outside the gate, but no outliers
     assert outcomes(judge(always, OUTLYING - 0.1, 20)) == [GATED] * 20
 

@@ -441,13 +441,15 @@ def test_outliers_among_used_detections_are_named_from_a_twentieth_on():
 @pytest.mark.parametrize(
     ("params", "told"),
     [
-        ({"kernel": {"shape": "cauchy", "width": 1.5}}, ", with less weight by its kernel: look"),
-        ({"kernel": {"shape": "none"}}, ", with full weight (kernel.shape sets a kernel): look"),
-        ({"kernel_width": 1.5}, ", with less weight by its kernel: look"),
-        ({"kernel_width": 0.0}, ", with full weight (kernel_width sets a kernel): look"),
+        ({"kernel": {"shape": "cauchy", "width": 1.5}}, ", with less weight by its kernel"),
+        ({"kernel": {"shape": "none"}}, ", with full weight (kernel.shape sets a kernel)"),
+        ({"kernel_width": 1.5}, ", with less weight by its kernel"),
+        ({"kernel_width": 0.0}, ", with full weight (kernel_width sets a kernel)"),
     ],
 )
-def test_of_outliers_that_were_used_is_told_how_much_they_count(params, told):
+def test_of_outliers_that_were_used_is_told_how_much_they_count_in_each_run(params, told):
     comparison = with_map(IDS, [0.0] * 4, detections=log_of([Outcome.USED] * 9, [1.0] * 9))
-    (line,) = sentences.outliers(with_run(comparison, replace(comparison.runs[0], params=params)))
-    assert f"isam2 9 of 9{told}" in line
+    (run,) = comparison.runs
+    runs = [replace(run, estimator="no setting", params={}), replace(run, params=params)]
+    (line,) = sentences.outliers(replace(comparison, runs=runs))
+    assert f"no setting 9 of 9; isam2 9 of 9{told}: look" in line

@@ -49,6 +49,10 @@ def test_a_missing_file_or_folder_is_named(folder):
     (folder / "DVL.log").unlink()
     with pytest.raises(DatasetError, match=rf"{folder.name}: holds no DVL\.log; give the folder that holds MTI"):
         read_stpere(folder)
+    (folder / "MTI.log").rename(folder / "mti.txt")
+    with pytest.raises(DatasetError, match=r"holds no MTI\.log, DVL\.log; give"):
+        read_stpere(folder)
+    (folder / "mti.txt").rename(folder / "MTI.log")
     (folder / "DVL.log").mkdir()
     with pytest.raises(DatasetError, match=r"DVL\.log: cannot be read"):
         read_stpere(folder)
