@@ -13,8 +13,21 @@ import math
 import numpy as np
 
 from sonar_graph.measurements import Floats
-from sonar_graph.numerics import compiled, inlined
-from sonar_graph.numerics.matrices import I3, O3, Mat3, Mat6, Vec3, Vec6, exp_and_mean, mat6, rodrigues, skew, vec
+from sonar_graph.numerics import (
+    I3,
+    O3,
+    Mat3,
+    Mat6,
+    Vec3,
+    Vec6,
+    compiled,
+    exp_and_mean,
+    inlined,
+    mat6,
+    rodrigues,
+    skew,
+    vec,
+)
 
 SERIES_RAD2 = 1e-2
 """Squared angle below which series serve: their next terms are below 1e-12."""
