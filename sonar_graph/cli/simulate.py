@@ -60,11 +60,11 @@ _OTHERS = (
     "anonymous_share, false_detections_per_frame, confident_false_fraction, start_position_sigma_m, "
     "start_rotation_sigma_rad, floor_sigma_m, speed_m_s; and with --images image.NAME: scene, contrast_db, plate_db, "
     "foam_height_m, sediment, fouling, texture_shape, texture_length_m, ripple_height_m, ripple_length_m, noise_db, "
-    "strangers, attitude_error_deg, altitude_error_m, sonar, designs, speckle, side_lobes, cross_talk_db, "
+    "strangers, attitude_error_deg, altitude_error_m, sonar, window_m, designs, speckle, side_lobes, cross_talk_db, "
     "measured_lens, floor_db, absorption_db_m, tvg_error_db, joints, shadows, multipath, surface_path_db, "
-    "floor_reflection, drop_probability, time_offset_s, sound_speed_error, stones, decoys. image.scene is a preset of "
-    "those from contrast_db to altitude_error_m: easy (default), murky, worn or hard. image.designs is a TOML file of "
-    "at least four landmarks; the four lowest ids are laid, in their order"
+    "floor_reflection, drop_probability, time_offset_s, sound_speed_error, stones, decoys. image.scene is a preset "
+    "of those from contrast_db to altitude_error_m: easy (default), murky, worn or hard. image.designs is a TOML "
+    "file of at least four landmarks; the four lowest ids are laid, in their order"
 )
 """Written out, so that help need not import the simulator."""
 worlds = typer.Typer(
