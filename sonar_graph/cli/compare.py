@@ -243,8 +243,9 @@ def compare_log(
     from sonar_graph.diagnosis import doubts
     from sonar_graph.evaluation import compare as compare_runs
     from sonar_graph.evaluation import expense
+    from sonar_graph.logs import no_images
     from sonar_graph.logs.adapters import LogConfig
-    from sonar_graph.recognition import no_images, with_detections
+    from sonar_graph.recognition import with_detections
 
     with progress_bars() as progress:
         sequence = reading.read(log, progress=partial(progress, f"reading {log.name}"))

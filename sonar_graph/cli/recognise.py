@@ -30,9 +30,12 @@ from sonar_graph.files import replacing
 if TYPE_CHECKING:
     from sonar_graph.calibration import Calibration
     from sonar_graph.devices import LandmarkDesign
-    from sonar_graph.recognition import LandmarkRecogniser, Recognition
+    from sonar_graph.logs import ImagesAlone
+    from sonar_graph.recognition import LandmarkRecogniser, MotionFrom, Recognition
     from sonar_graph.sequence import Sequence
     from sonar_graph.sonar import RecogniserParams
+
+    Run = Sequence | ImagesAlone
 
 TOPIC = "/sonar/landmarks"
 RECORD = "sonar_graph_recognition"
@@ -44,6 +47,13 @@ RecogniserName = Annotated[
     Literal["designs", "actag"],
     typer.Option(
         "--recogniser", help="designs: ours; actag: AcTag's own detector, which sees AcTags only (extra actag)."
+    ),
+]
+Motion = Annotated[
+    Literal["navigation", "images", "fixed"] | None,
+    typer.Option(
+        help="How the sonar moves between frames: by IMU and Doppler log (the default where the log has both), as the "
+        "images themselves show (else), or not at all.",
     ),
 ]
 Settings = Annotated[
@@ -123,19 +133,22 @@ def recognise(
     recognition: RecogniserOptions,
     reading: ReadingOptions,
     recogniser: RecogniserName = "designs",
+    motion: Motion = None,
     settings: Settings = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Recognise landmarks in a log's sonar images; write the log anew with the detections in it.
 
-    Detections that an earlier recognise put into the log are replaced.
+    Detections that an earlier recognise put into the log are replaced. Without IMU or Doppler log the motion is from
+    the images.
     """
-    from sonar_graph.logs import DETECTIONS, METADATA, detection_messages, with_notes, write_amended
-    from sonar_graph.recognition import no_images
+    from sonar_graph.logs import DETECTIONS, METADATA, detection_messages, no_images, with_notes, write_amended
 
     path = writable_log(output, log, overwrite=overwrite)
-    sequence = reading.read(log, images=True)
-    found = recognise_log(log, sequence, reading, recognition.recogniser(sequence.calibration, settings, recogniser))
+    sequence, motion = with_motion(log, reading, motion)
+    found = recognise_log(
+        log, sequence, reading, recognition.recogniser(sequence.calibration, settings, recogniser), motion
+    )
     if found is None:
         raise LogError(no_images(log))
     with working("writing"):
@@ -156,8 +169,11 @@ def recognise(
     out.print(f"{found.frames} frames, {0 if found.detections is None else len(found.detections)} detections")
     for outcome, count in found.outcomes.most_common():
         out.print(f"  {count:6d}  {outcome}")
-    for line in found.naming(sequence.true_landmarks):
+    for line in found.naming(getattr(sequence, "true_landmarks", None)):
         out.print(line)
+    if motion != "navigation":
+        for line in without_navigation(found):
+            echo(f"Without navigation: {line}")
     for stamp_ns, reason in found.warnings[:MOST_WARNINGS_SHOWN]:
         out.print(f"Warning: {(stamp_ns - sequence.start_ns) * 1e-9:.3f} s: {reason}")
     if (more := sum(found.warned().values()) - MOST_WARNINGS_SHOWN) > 0:
@@ -215,8 +231,54 @@ def calibrate(
     echo(f"Model: {path}")
 
 
+def with_motion(log: Path, reading: ReadingOptions, motion: MotionFrom | None) -> tuple[Run, MotionFrom]:
+    """Read what goes with a log's images, and say how the sonar's motion will be known."""
+    from sonar_graph.logs import lacking_navigation, read_images_alone
+
+    lacking = lacking_navigation(log, reading.choices, reading.config, reading.window)
+    if motion == "navigation" and lacking:
+        raise LogError(
+            f"{log}: --motion navigation: no {' and no '.join(map(str.upper, lacking))} in the log; leave --motion "
+            "out, or bring the sensors of another file in with `sonar-graph join`"
+        )
+    if motion == "navigation" or (motion is None and not lacking):
+        return reading.read(log, images=True), "navigation"
+    alone = read_images_alone(
+        log,
+        calibration=reading.given,
+        topic=reading.choices.get("sonar"),
+        config=reading.config,
+        window=reading.window,
+        salvage=reading.salvage,
+    )
+    return alone, motion or "images"
+
+
+def without_navigation(found: Recognition) -> list[str]:
+    """Lines on where the motion is from, and what is lost."""
+    from sonar_graph.recognition import NO_FLOOR
+
+    motion, lines = found.notes["detections.motion"], []
+    lines.append(f"motion {motion}")
+    if motion.startswith("none"):
+        lines.append("frames of a sonar at rest repeat their speckle, so that each track counts once")
+    if NO_FLOOR in found.outcomes:
+        lines.append(
+            "height and tilt are not known, so that designs are compared in the plane of the image; a file for "
+            "--calibration states them: [floor] z_m, sigma_m and [start] position_m, rpy_rad"
+        )
+    else:
+        lines.append("height and tilt are taken to stay those of the calibration's start")
+    lines.append("no estimator can run on the images alone; `sonar-graph join` brings in IMU and Doppler log of a file")
+    return lines
+
+
 def recognise_log(
-    log: Path, sequence: Sequence, reading: ReadingOptions, recogniser: LandmarkRecogniser
+    log: Path,
+    sequence: Run,
+    reading: ReadingOptions,
+    recogniser: LandmarkRecogniser,
+    motion: MotionFrom = "navigation",
 ) -> Recognition | None:
     """Landmarks in a log's sonar images, with a progress bar; None without images."""
     from sonar_graph.recognition import recognise_images
@@ -225,6 +287,7 @@ def recognise_log(
         return recognise_images(
             log,
             sequence,
+            motion=motion,
             topic=reading.choices.get("sonar"),
             config=reading.config,
             recogniser=recogniser,
@@ -234,7 +297,7 @@ def recognise_log(
         )
 
 
-def warn_of_other_designs(sequence: Sequence) -> None:
+def warn_of_other_designs(sequence: Run) -> None:
     """Print a warning if a log's notes name designs of its own, which were not looked for."""
     named = re.search(r'"designs":"([^"]+)"', sequence.notes.get("options", ""))
     if named is not None:

@@ -7,6 +7,7 @@ from sonar_graph import at_first_use
 
 if TYPE_CHECKING:
     from sonar_graph.logs.amending import Amended, write_amended
+    from sonar_graph.logs.images_alone import ImagesAlone, lacking_navigation, no_images, read_images_alone
     from sonar_graph.logs.inspection import LogSummary, TopicSummary, inspect_log
     from sonar_graph.logs.reading import read_log, read_sonar_frames
     from sonar_graph.logs.result_log import write_result
@@ -19,7 +20,8 @@ else:
     __getattr__ = at_first_use(__name__)
 
 __all__ = [
-    "Amended", "DETECTIONS", "LogSummary", "METADATA", "PICTURES", "PartialCalibration", "Picture", "TopicSummary",
-    "detection_messages", "inspect_log", "read_log", "read_sonar_frames", "sonar_image_messages", "with_notes",
-    "write_amended", "write_landmarks_csv", "write_result", "write_log", "write_tum",
+    "Amended", "DETECTIONS", "ImagesAlone", "LogSummary", "METADATA", "PICTURES", "PartialCalibration", "Picture",
+    "TopicSummary", "detection_messages", "inspect_log", "lacking_navigation", "no_images", "read_images_alone",
+    "read_log", "read_sonar_frames", "sonar_image_messages", "with_notes", "write_amended", "write_landmarks_csv",
+    "write_log", "write_result", "write_tum",
 ]

@@ -2,14 +2,16 @@
 
 # fmt: off
 from sonar_graph.recognition.confusion_fit import calibrate
+from sonar_graph.recognition.image_motion import ImageMotions, MotionFrom
 from sonar_graph.recognition.recognition_record import (
     PICTURE_FOLDER, RECOGNITION, SURE, DrawnFrame, Recognition, read_recognition, write_recognition,
 )
 from sonar_graph.recognition.session import (
-    LandmarkRecogniser, no_images, recognise, recognise_images, with_detections,
+    NO_FLOOR, LandmarkRecogniser, recognise, recognise_images, with_detections,
 )
 
 __all__ = [
-    "DrawnFrame", "LandmarkRecogniser", "PICTURE_FOLDER", "RECOGNITION", "Recognition", "SURE", "calibrate",
-    "no_images", "read_recognition", "recognise", "recognise_images", "with_detections", "write_recognition",
+    "DrawnFrame", "ImageMotions", "LandmarkRecogniser", "MotionFrom", "NO_FLOOR", "PICTURE_FOLDER", "RECOGNITION",
+    "Recognition", "SURE", "calibrate", "read_recognition", "recognise", "recognise_images", "with_detections",
+    "write_recognition",
 ]

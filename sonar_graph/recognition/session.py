@@ -2,7 +2,8 @@
 
     images -> one frame at a time -> motion, tilt and height at its stamp -> Recogniser.process -> LandmarkDetections
 
-Images are streamed. Motion, tilt and height come from the other sensors (`sonar_graph.recognition.sonar_motion`).
+Images are streamed. Motion, tilt and height come from the other sensors (`sonar_graph.recognition.sonar_motion`), or
+motion from the images themselves (`sonar_graph.recognition.image_motion`).
 Detections are made once for a log, and are the same for all estimators. Design: docs/design/0009-recognition.md.
 """
 
@@ -17,10 +18,12 @@ from sonar_graph.calibration import Calibration
 from sonar_graph.devices import LandmarkDesign
 from sonar_graph.errors import LogError, MeasurementError
 from sonar_graph.images import SonarFrames, decibels
-from sonar_graph.logs import PartialCalibration, read_log, read_sonar_frames
+from sonar_graph.logs import ImagesAlone, PartialCalibration, read_log, read_sonar_frames
+from sonar_graph.logs import no_images as no_images
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.logs.mcap import TimeWindow
 from sonar_graph.measurements import NS_PER_S, LandmarkDetections
+from sonar_graph.recognition.image_motion import ImageMotions, MotionFrom
 from sonar_graph.recognition.recognition_record import DrawnFrame, Recognition, as_jpeg, draw_fan
 from sonar_graph.recognition.sonar_motion import SonarMotions
 from sonar_graph.sequence import Sequence as Run
@@ -140,8 +143,9 @@ def recognise(
 
 def recognise_images(
     images: Path | str | Iterable[SonarFrames],
-    sequence: Run,
+    sequence: Run | ImagesAlone,
     *,
+    motion: MotionFrom = "navigation",
     topic: str | None = None,
     config: LogConfig | None = None,
     designs: Sequence[LandmarkDesign] | None = None,
@@ -155,8 +159,10 @@ def recognise_images(
 
     Parameters and errors are those of `recognise`, with the topic of the images and the window and salvage of the
     sequence; ``progress`` is called with the number of frames done. None where there are no images.
+
+    Without IMU and Doppler log (`ImagesAlone`) the motion is from the images; "fixed" is of a sonar at rest.
     """
-    session = RecognitionSession(sequence, designs, params, recogniser=recogniser)
+    session = RecognitionSession(sequence, designs, params, recogniser=recogniser, motion=motion)
     if isinstance(images, Path | str):
         images = read_sonar_frames(Path(images), topic, config, window=window, salvage=salvage, refused=session.refuse)
     for _ in session.run(images):
@@ -168,14 +174,6 @@ def recognise_images(
 def with_detections(sequence: Run, recognition: Recognition) -> Run:
     """The sequence with the detections of a recognition, and its notes."""
     return replace(sequence, detections=recognition.detections, notes=sequence.notes | recognition.notes)
-
-
-def no_images(log: Path | str) -> str:
-    """Message for a log without sonar images."""
-    return (
-        f"{log}: has no sonar images; `sonar-graph inspect {log}` lists what it has "
-        "(`sonar-graph compare` and read_log need none)"
-    )
 
 
 def one_by_one(block: SonarFrames) -> Iterator[SonarFrames]:
@@ -211,18 +209,23 @@ class RecognitionSession:
 
     def __init__(
         self,
-        sequence: Run,
+        sequence: Run | ImagesAlone,
         designs: Sequence[LandmarkDesign] | None = None,
         params: RecogniserParams | None = None,
         *,
         recogniser: LandmarkRecogniser | None = None,
         pictures: bool = True,
+        motion: MotionFrom = "navigation",
     ) -> None:
         self._draws = pictures
         self.result = Recognition()
         self.recogniser = recogniser or Recogniser(sequence.calibration, designs, params)
         self._sonar = sequence.calibration.sonar
-        self._motions = SonarMotions(sequence)
+        self._motions: SonarMotions | ImageMotions
+        if motion == "navigation" and isinstance(sequence, Run):
+            self._motions = SonarMotions(sequence)
+        else:
+            self._motions = ImageMotions(sequence.calibration, is_fixed=motion == "fixed")
         self._blocks: list[LandmarkDetections] = []
         self._fan: Fan | None = None
         self._fan_of: tuple[object, object] = (None, None)
@@ -243,6 +246,8 @@ class RecognitionSession:
             reason = OUT_OF_ORDER if self._motions.passed(stamp_ns) else NO_ODOMETRY
             self._warn(stamp_ns, f"{NOT_USED}: {reason}")
             return None
+        if isinstance(self._motions, ImageMotions):
+            self._motions.look(frame)
         step, view = self._motions.at(stamp_ns)
         frame = with_lens(frame, self._sonar.lens)
         self.result.outcomes[NO_FLOOR] += view is None
@@ -270,6 +275,8 @@ class RecognitionSession:
         result = self.result
         result.detections = LandmarkDetections.concatenate(self._blocks) if self._blocks else None
         result.notes = {"detections": f"recognised in {result.frames} sonar images"} | self.recogniser.notes()
+        if isinstance(self._motions, ImageMotions):
+            result.notes |= self._motions.notes()
         result.outcomes = +result.outcomes  # drops zero counts
         result.warnings.sort(key=lambda row: row[0])
         if result.warnings:

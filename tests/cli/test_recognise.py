@@ -12,9 +12,12 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from sonar_graph.logs.mcap.writer import recording
 from sonar_graph.logs.reading import read_log
+from sonar_graph.logs.writing import sonar_image_messages
 from sonar_graph.recognition import confusion_fit
 from sonar_graph.sonar.confusion import read_confusion
+from tests.recognition.imaged_lane import TOPIC
 
 QUICK = ("--estimators", "dead-reckoning")
 DESIGNS = """
@@ -139,6 +142,27 @@ def test_designs_of_ones_own_and_settings_need_no_code(lane_log, run, tmp_path, 
     assert np.unique(found.candidate_ids).tolist() == [4]
     assert run("recognise", lane_log, "-o", tmp_path / "none.mcap", "--set", "least_frames=10000") == 0
     assert read_log(tmp_path / "none.mcap").detections is None
+
+
+def test_images_alone_are_recognised_and_what_is_lost_is_said(lane, run, tmp_path, capsys):
+    log, out = tmp_path / "sonar.mcap", tmp_path / "out.mcap"
+    with recording(log, {}) as writer:
+        writer.write([sonar_image_messages(TOPIC, lane.frames)])
+    assert run("recognise", log, "-o", out, "--motion", "navigation") == 2
+    assert "no IMU and no DVL in the log; leave --motion out" in capsys.readouterr().err
+    (tmp_path / "over.json").write_text(lane.sequence.calibration.model_dump_json(exclude_unset=True))
+    for more, said in (
+        ((), "height and tilt are not known, so that designs are compared in the plane of the image; a file for "),
+        (("--motion", "fixed"), "motion none: the sonar is taken to be at rest"),
+        (("--calibration", tmp_path / "over.json"), "height and tilt are taken to stay those of the calibration's"),
+    ):
+        assert run("recognise", log, "-o", out, *more) == 0
+        lines = capsys.readouterr().out
+        assert f"Without navigation: {said}" in lines
+        assert "no estimator can run on the images alone; `sonar-graph join`" in lines
+    with out.open("rb") as stream:
+        topics = {channel.topic for _, channel, _ in make_reader(stream).iter_messages()}
+    assert topics == {TOPIC, "/sonar/landmarks"}
 
 
 class Decoder:

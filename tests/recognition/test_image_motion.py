@@ -1,0 +1,105 @@
+"""Motion from the images alone, against the true motion of the lane, and what is recognised with it."""
+
+from itertools import pairwise
+
+import gtsam
+import numpy as np
+import pytest
+
+from sonar_graph.calibration import Calibration
+from sonar_graph.images import SonarFrames
+from sonar_graph.logs.images_alone import ImagesAlone, lacking_navigation, read_images_alone
+from sonar_graph.logs.reading import read_log
+from sonar_graph.logs.writing import write_log
+from sonar_graph.measurements import Floats
+from sonar_graph.recognition.image_motion import ImageMotions
+from sonar_graph.recognition.recognition_record import Recognition
+from sonar_graph.recognition.session import RecognitionSession
+from tests.recognition.imaged_lane import Lane
+
+SURE, RANGE_M = 0.9, 1.9
+"""RANGE_M: the middle of the images, where motion across the line of sight is seen best."""
+
+
+def true_steps(lane: Lane, rows: range, body_T_sonar: gtsam.Pose3) -> list[gtsam.Pose3]:
+    poses = lane.sequence.truth.at(lane.frames.stamps_ns[rows.start : rows.stop])
+    pairs = zip(poses.matrices, poses.positions, strict=True)
+    sonar = [gtsam.Pose3(gtsam.Rot3(matrix), place) * body_T_sonar for matrix, place in pairs]
+    return [before.inverse() * now for before, now in pairwise(sonar)]
+
+
+def in_plane(steps: list[gtsam.Pose3], level_R_sonar: Floats) -> Floats:
+    """Yaw, x, y of each step in level axes."""
+    level_T_sonar = gtsam.Pose3(gtsam.Rot3(level_R_sonar), np.zeros(3))
+    turned = [level_T_sonar * step * level_T_sonar.inverse() for step in steps]
+    return np.array([[step.rotation().yaw(), step.x(), step.y()] for step in turned])
+
+
+def look_at_all(lane: Lane, motions: ImageMotions, rows: range) -> list:
+    return [step for row in rows if (step := motions.look(lane.one(row))) is not None]
+
+
+@pytest.mark.parametrize("is_floor_known", [True, False])
+def test_steps_are_the_true_ones_within_their_covariance(lane, is_floor_known):
+    calibration, rows = lane.sequence.calibration, range(60)
+    if not is_floor_known:
+        calibration = calibration.model_copy(update={"floor": None})
+    motions = ImageMotions(calibration)
+    steps = look_at_all(lane, motions, rows)
+    assert (motions.view is not None) == is_floor_known
+    assert motions.measured == motions.steps == len(rows) - 1
+    level_R_sonar = np.eye(3) if motions.view is None else motions.view.level_R_sonar
+    true = in_plane(true_steps(lane, rows, calibration.sonar.mounting.pose()), level_R_sonar)
+    found = np.array([step.motion for step in steps])
+    errors = found - true
+    across = errors[:, 2] + RANGE_M * errors[:, 0]
+    assert np.sqrt(np.mean(errors[:, 1] ** 2)) < 0.2 * np.sqrt(np.mean(true[:, 1] ** 2))
+    assert np.sqrt(np.mean(across**2)) < 0.004
+    nees = np.array([e @ np.linalg.solve(step.covariance, e) for e, step in zip(errors, steps, strict=True)])
+    assert 0.3 < nees.mean() / 3 < 3.0
+
+
+def test_a_frame_of_another_scene_is_not_laid_upon_the_one_before(lane):
+    motions = ImageMotions(lane.sequence.calibration)
+    look_at_all(lane, motions, range(3))
+    rng, other = np.random.default_rng(1), lane.one(3)
+    noise = rng.rayleigh(40.0, other.intensity.shape).astype(np.uint8)
+    step = motions.look(SonarFrames(other.stamps_ns, noise, other.ranges_m, other.azimuths_rad))
+    assert not step.is_measured
+    assert step.covariance[1, 1] > (0.05) ** 2 * step.duration_s
+    assert motions.notes()["detections.motion"] == "from the images: 2 of 3 steps measured"
+
+
+def test_a_fixed_sonar_does_not_move_whatever_its_images_show(lane):
+    motions = ImageMotions(lane.sequence.calibration, is_fixed=True)
+    assert look_at_all(lane, motions, range(4)) == []
+    step, _ = motions.at(int(lane.frames.stamps_ns[3]))
+    assert step.previous_T_sonar.equals(gtsam.Pose3(), 0)
+    assert not step.covariance.any()
+
+
+def recognised(lane: Lane, calibration: Calibration) -> Recognition:
+    alone = ImagesAlone("lane", calibration, int(lane.frames.stamps_ns[0]), {})
+    session = RecognitionSession(alone, pictures=False)
+    for row in range(len(lane.frames)):
+        session.take(lane.one(row))
+    return session.finish()
+
+
+def test_landmarks_are_recognised_by_images_alone(lane, lane_recognition):
+    found = recognised(lane, lane.sequence.calibration)
+    named, probability = found.detections.most_probable()
+    assert set(named[probability > SURE].tolist()) == {1, 2, 3, 4}
+    expected = lane_recognition.detections
+    stamps = set(expected.stamps_ns[expected.most_probable()[1] > SURE].tolist())
+    assert len(stamps & set(found.detections.stamps_ns[probability > SURE].tolist())) > 0.5 * len(stamps)
+    assert found.notes["detections.motion"].startswith("from the images")
+
+
+def test_what_a_log_lacks_is_known_before_it_is_read(lane, lane_log, tmp_path):
+    assert lacking_navigation(lane_log, {}) == []
+    assert read_images_alone(lane_log).calibration == read_log(lane_log).calibration
+    assert read_images_alone(lane_log).start_ns == lane.frames.stamps_ns[0]
+    write_log(tmp_path / "bare.mcap", lane.sequence)
+    with pytest.raises(Exception, match=r"bare\.mcap: has no sonar images"):
+        read_images_alone(tmp_path / "bare.mcap")
