@@ -19,6 +19,7 @@ from sonar_graph.cli.bench import benches
 from sonar_graph.cli.compare import compare, demo, estimators, report, run
 from sonar_graph.cli.convert_data import datasets
 from sonar_graph.cli.inspect_log import inspect
+from sonar_graph.cli.join import join
 from sonar_graph.cli.recognise import calibrate, recognise
 from sonar_graph.cli.simulate import worlds
 from sonar_graph.errors import SonarGraphError
@@ -52,6 +53,12 @@ app.command(
         "sonar-graph compare dive.mcap --log-config dive.toml -o comparison",
     )
 )(compare)
+app.command(
+    epilog=examples(
+        "sonar-graph join dive.aris dive.mcap -o joined.mcap",
+        "sonar-graph join dive_sonar.mcap dive.mcap --offset 3600 --search 30 -o joined.mcap",
+    )
+)(join)
 app.command(
     epilog=examples(
         "sonar-graph recognise dive.mcap -o recognised.mcap",

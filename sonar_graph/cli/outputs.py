@@ -17,19 +17,19 @@ from sonar_graph.errors import EvaluationError, LogError, SonarGraphError
 from sonar_graph.files import COMPARISON, read_json, result_folder
 
 
-def writable_log(path: Path, source: Path | None = None, *, overwrite: bool = False) -> Path:
+def writable_log(path: Path, *sources: Path | None, overwrite: bool = False) -> Path:
     """Check that a log can be written, say whether it replaces another, and return ``path``.
 
-    The source, a file or folder, is never overwritten; a file that this package did not write, only if asked for.
+    A source, a file or folder, is never overwritten; a file that this package did not write, only if asked for.
 
-    Raises `LogError` when it is a folder, is not called ``*.mcap``, is the source or a part of it, is a file that this
+    Raises `LogError` when it is a folder, is not called ``*.mcap``, is a source or a part of it, is a file that this
     package did not write, or its folder cannot be written to.
     """
     if path.is_dir():
         raise LogError(f"{path}: is a folder; give the name of a file such as {path / 'log.mcap'}")
     if path.suffix != ".mcap":
         raise LogError(f"{path}: logs are MCAP files; give a name that ends in .mcap")
-    if source is not None and _is_part_of(path, source):
+    if any(source is not None and _is_part_of(path, source) for source in sources):
         raise LogError(f"{path}: is what is read, and would be overwritten; choose another name with -o")
     if not (overwrite or _is_replaceable(path)):
         raise LogError(f"{path}: exists, and sonar-graph did not write it; choose another name, or give --overwrite")

@@ -6,7 +6,7 @@ The log is read as every log is (`sonar_graph.logs.mcap.reader`): of one that is
 import heapq
 import zlib
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
@@ -44,6 +44,7 @@ def write_amended(
     target: Path,
     added: Sequence[Outgoing],
     *,
+    more: Iterable[Outgoing] = (),
     anew: Mapping[str, str] | None = None,
     metadata: Mapping[str, Mapping[str, str]] | None = None,
     salvage: bool = False,
@@ -58,6 +59,9 @@ def write_amended(
         Another file; one that exists is replaced when the new one is complete.
     added
         Messages on topics that the log does not have, or that are written anew.
+    more
+        The same for messages that do not fit into memory at once, such as images: entries of one topic in the order of
+        time, each taken when the one before is written.
     anew
         Types by topic; the messages of the log on these topics are left out.
     metadata
@@ -74,14 +78,16 @@ def write_amended(
     if target.exists() and target.samefile(source):
         raise LogError(f"{target}: is the log itself; give another name with -o")
     with LogFile(source) as log, written_whole(target) as out:
-        return _AmendedCopy(log, out, anew or {}, {entry.topic for entry in added}).run(added, metadata or {}, salvage)
+        return _AmendedCopy(log, out, anew or {}, {entry.topic for entry in added}).run(
+            added, more, metadata or {}, salvage
+        )
 
 
 class _AmendedCopy:
     """A log on its way into another file."""
 
     def __init__(self, log: LogFile, out: BinaryIO, anew: Mapping[str, str], added: Set[str]) -> None:
-        self._log, self._anew, self._taken = log, anew, added - anew.keys()
+        self._log, self._anew, self._taken = log, anew, set(added - anew.keys())
         self._passage = Passage(log, lambda _: Keep.ALL, may_skip=False)
         self._writer = Writer(out, chunk_size=_CHUNK_BYTES, enable_data_crcs=True)
         self._schemas: dict[tuple[str, str, bytes], int] = {("", "", b""): 0}
@@ -89,7 +95,13 @@ class _AmendedCopy:
         self._amended = Amended()
         self._beginning_ns: int | None = None
 
-    def run(self, added: Sequence[Outgoing], metadata: Mapping[str, Mapping[str, str]], salvage: bool) -> Amended:
+    def run(
+        self,
+        added: Sequence[Outgoing],
+        more: Iterable[Outgoing],
+        metadata: Mapping[str, Mapping[str, str]],
+        salvage: bool,
+    ) -> Amended:
         writer, passage, amended = self._writer, self._passage, self._amended
         with self._log.path.open("rb") as stream:
             try:
@@ -97,8 +109,9 @@ class _AmendedCopy:
             except McapError:
                 head = None
         writer.start(profile=head.profile if isinstance(head, Header) else "", library=LIBRARY)
-        both = heapq.merge(self._recorded(), self._added(added), key=lambda message: message[0])
-        for log_time, publish_time, topic, payload, number in both:
+        # those of ``more`` are asked first: their topic is taken before the log's are copied
+        merged = heapq.merge(self._streamed(more), self._recorded(), self._added(added), key=lambda message: message[0])
+        for log_time, publish_time, topic, payload, number in merged:
             writer.add_message(self._channels[topic], log_time, payload, publish_time, number)
         recording = Recording(self._log.path, damage=passage.damage, beginning_ns=self._beginning_ns)
         if not salvage:
@@ -166,6 +179,11 @@ class _AmendedCopy:
             text = definition(entry.type_name).encode()
             self._offer(entry.topic, (entry.type_name, "ros2msg", text), "cdr", {})
             yield time_ns, time_ns, entry.topic, entry.payloads[row].tobytes(), 0
+
+    def _streamed(self, more: Iterable[Outgoing]) -> Iterator[_Message]:
+        for entry in more:
+            self._taken.add(entry.topic)
+            yield from self._added([entry])
 
     def _offer(self, topic: str, schema: tuple[str, str, bytes], encoding: str, metadata: Mapping[str, str]) -> None:
         """Make a topic known to the writer, once; a schema is name, encoding and text."""

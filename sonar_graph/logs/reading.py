@@ -213,7 +213,8 @@ class Assembly:
     def _gathered(self, given: PartialCalibration | None) -> Calibration:
         """The calibration of user, record, ``/tf_static`` and defaults, with its sources in the notes."""
         recorded = read_calibration(self._recording)
-        self._is_start_stated = recorded is not None or bool(given and "start" in given.values)
+        is_recorded = recorded is not None and bool(recorded.model_fields_set - {"sonar"})  # images bring their own
+        self._is_start_stated = is_recorded or bool(given and "start" in given.values)
         stated = mounted_by(recorded.model_dump(exclude_unset=True)) if recorded else set()
         stated |= mounted_by(given.values) if given else set()
         frames = {
@@ -240,8 +241,9 @@ class Assembly:
         mounted = mountings.keys() | stated
         self._is_mounting_known = "dvl" in mounted
         source = "from the log"
-        if recorded is None:
-            source = f"defaults; mountings from /tf_static: {', '.join(mountings) or 'none'}"
+        if not is_recorded:
+            source = "defaults" if recorded is None else "the sonar's from the log; else defaults"
+            source += f"; mountings from /tf_static: {', '.join(mountings) or 'none'}"
             missing = [f"{name} ({frame or 'unnamed'})" for name, frame in frames.items() if name not in mounted]
             source += f"; not in the tree, taken as base_link: {', '.join(missing)}" if missing else ""
         if given:

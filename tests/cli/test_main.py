@@ -63,7 +63,7 @@ def test_every_command_and_group_has_help_that_ends_in_examples(run, path, capsy
 def test_examples_in_help_are_understood(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     files = "dive.mcap vehicle.toml dive.toml dive.bag dive.ddf dive.aris pings.raw reference.json suite.toml"
-    for name in files.split():
+    for name in (*files.split(), "dive_sonar.mcap", "labels.json"):
         Path(name).touch()
     for name in ("comparison", "MRCLAM_Dataset6", "DLR", "A-KIT", "StPereDataset", "ros2_bag_folder", "results"):
         Path(name).mkdir()
@@ -100,5 +100,16 @@ def test_every_command_that_writes_from_a_file_is_tried_in_the_tests_of_outputs(
     """A command that joins later must not be forgotten."""
     writing = {path[-1] for path, c in commands().items() if any(option.name == "output" for option in c.params)}
     of_folders, of_nothing = {"mrclam", "dlr", "akit", "stpere"}, {"basin", "demo"}
-    tried = {"rosbag", "didson", "aris", "oculus", "victoria-park", "compare", "recognise", "landmarks", "calibrate"}
+    tried = {
+        "rosbag",
+        "didson",
+        "aris",
+        "oculus",
+        "victoria-park",
+        "compare",
+        "recognise",
+        "landmarks",
+        "calibrate",
+        "join",
+    }
     assert writing == tried | of_folders | of_nothing | {"run"}

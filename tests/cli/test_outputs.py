@@ -45,6 +45,18 @@ def test_a_log_made_from_a_file_never_replaces_it(command, flags, basin, run, tm
     assert basin.read_bytes() == before
 
 
+def test_neither_of_two_logs_that_are_joined_is_replaced(basin, run, tmp_path, capsys):
+    before, other = basin.read_bytes(), tmp_path / "other.mcap"
+    other.write_bytes(before)
+    for order in ((basin, other), (other, basin)):
+        for output in (basin, *links(basin, tmp_path)):
+            assert run("join", *order, "-o", output, "--overwrite") == 2
+            assert "is what is read" in capsys.readouterr().err
+            if output != basin:
+                output.unlink()
+    assert basin.read_bytes() == before
+
+
 def test_a_part_of_a_bag_or_a_log_under_another_ending_is_not_overwritten_either(basin, run, tmp_path, capsys):
     part, model = tmp_path / "bag" / "bag_0.mcap", tmp_path / "log.json"
     contents = foreign_log(part), basin.read_bytes()

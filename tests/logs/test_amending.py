@@ -150,3 +150,15 @@ def test_a_damaged_attachment_is_left_out_and_named(tmp_path):
     amended = write_amended(tmp_path / "bad.mcap", tmp_path / "b.mcap", [], salvage=True)
     assert "damaged and left out" in amended.notes["log.attachments"]
     assert content(tmp_path / "b.mcap")["attachments"] == []
+
+
+def test_messages_that_come_piece_by_piece_are_merged_and_their_topic_must_be_new(tmp_path):
+    source = foreign_log(tmp_path / "source.mcap")
+    plain, streamed = tmp_path / "plain.mcap", tmp_path / "streamed.mcap"
+    entries = [landmarks(time_ns) for time_ns in (5, 1005, 2005)]
+    write_amended(source, plain, entries)
+    write_amended(source, streamed, [], more=iter(entries))
+    assert content(streamed) == content(plain)
+    taken = next(iter(content(source)))
+    with pytest.raises(LogError, match="is in the log already"):
+        write_amended(source, streamed, [], more=iter([landmarks(5, taken)]))

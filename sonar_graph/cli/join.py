@@ -1,0 +1,222 @@
+"""``sonar-graph join``: sonar images of one file with IMU, Doppler log and the rest of another."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from sonar_graph.cli.arguments import OutputLog, Overwrite, ReadingOptions, echo, with_options
+from sonar_graph.cli.outputs import progress_bars, working, writable_log
+from sonar_graph.errors import LogError
+
+if TYPE_CHECKING:
+    from sonar_graph.calibration import Calibration
+    from sonar_graph.images import SonarFrames
+    from sonar_graph.logs.mcap import Outgoing
+    from sonar_graph.recognition import ClockOffset, PlanarStep
+    from sonar_graph.sequence import Sequence
+
+TOPIC = "/sonar/image"
+SEARCH_S = 10.0
+DISAGREEING = 4.0
+"""Standard deviations of the estimated offset beyond which a stated one is doubted."""
+OF_THE_IMAGES = ("image", "lens", "elevation_aperture_rad")
+"""Fields of a sonar's calibration that a recording of images knows better than a log without."""
+NS_PER_S = 10**9
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """Motion that the images of a file show."""
+
+    stamps_ns: list[int]
+    steps: list[PlanarStep]
+    range_m: float
+    """Middle of their window."""
+
+    def count_within(self, sequence: Sequence, shift_ns: int) -> int:
+        """Number of frames with IMU and Doppler log, once their stamps are moved."""
+        return sum(sequence.start_ns <= stamp_ns + shift_ns <= sequence.end_ns for stamp_ns in self.stamps_ns)
+
+
+@with_options("start", "end")
+def join(
+    images: Annotated[
+        Path,
+        typer.Argument(
+            metavar="IMAGES", exists=True, dir_okay=False, help="Log with sonar images, or an .aris or .ddf file."
+        ),
+    ],
+    navigation: Annotated[
+        Path, typer.Argument(metavar="NAV", exists=True, dir_okay=False, help="MCAP log with IMU and Doppler log.")
+    ],
+    output: OutputLog,
+    reading: ReadingOptions,
+    offset: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SECONDS",
+            help="To add to the images' stamps. Default: estimated, by what images and sensors say of the motion.",
+        ),
+    ] = None,
+    search: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SECONDS",
+            min=0.5,
+            max=3600.0,
+            help=f"Estimate the offset within so much of --offset, or of 0; {SEARCH_S:g} where neither is given.",
+        ),
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Write sonar images of one file and all that another has into one log, on the clock of the latter.
+
+    The options about topics and calibration are of NAV, but for the role sonar, which is of IMAGES.
+    """
+    from sonar_graph.logs import METADATA, read_images_alone, read_sonar_frames, with_notes, write_amended
+
+    path = writable_log(output, images, navigation, overwrite=overwrite)
+    sequence, topic = reading.read(navigation, images=True), reading.choices.get("sonar")
+    with as_log(images) as log:
+        alone = read_images_alone(log, topic=topic, salvage=reading.salvage)
+        seen = look(log, topic, alone.calibration, salvage=reading.salvage)
+        is_stated, around_s = offset is not None and search is None, offset or 0.0
+        require_overlap(images, navigation, sequence, seen, around_s, 0.0 if is_stated else search or SEARCH_S)
+        seconds, said = offset_of(seen, sequence, around_s, search or SEARCH_S, is_stated=is_stated)
+        shift_ns = round(seconds * NS_PER_S)
+        notes = {f"images.{key}": note for key, note in alone.notes.items()}
+        record = with_notes(navigation, notes | {"images.file": images.name, "images.clock_offset": said})
+        record |= {"calibration": with_sonar_of(alone.calibration, record.get("calibration", "{}"))}
+        with progress_bars() as progress:
+            blocks = read_sonar_frames(log, topic, salvage=reading.salvage, refused=lambda *_: None)
+            amended = write_amended(
+                navigation,
+                path,
+                [],
+                more=on_the_clock(blocks, shift_ns, lambda done: progress("writing (frames)", done, 0)),
+                metadata={METADATA: record},
+                salvage=reading.salvage,
+            )
+    echo(f"Clock offset, to be added to the stamps of {images.name}: {said}")
+    within = seen.count_within(sequence, shift_ns)
+    echo(f"{len(seen.stamps_ns)} frames, {within} of them while IMU and Doppler log measure")
+    for note in amended.notes.values():
+        echo(f"Not copied: {note}")
+    echo(f"Log: {path}\nNext: sonar-graph recognise {path} -o recognised.mcap")
+
+
+@contextmanager
+def as_log(images: Path) -> Iterator[Path]:
+    """The file with sonar images as an MCAP log, converted if its suffix is that of a sonar."""
+    from sonar_graph.logs.convert import convert_aris, convert_didson
+
+    converters: dict[str, Callable[..., Any]] = {".aris": convert_aris, ".ddf": convert_didson}
+    convert = converters.get(images.suffix.lower())
+    if convert is None and images.suffix.lower() != ".mcap":
+        raise LogError(
+            f"{images}: expected an .mcap, .aris or .ddf file; `sonar-graph convert oculus` makes a log of a recording "
+            "of an Oculus"
+        )
+    if convert is None:
+        yield images
+        return
+    with TemporaryDirectory() as folder, progress_bars() as progress:
+        log = Path(folder) / f"{images.stem}.mcap"
+        done = convert(images, log, progress=lambda at, total: progress(f"converting {images.name}", at, total))
+        for line in done.shortcomings(3):
+            echo(line)
+        yield log
+
+
+def look(log: Path, topic: str | None, calibration: Calibration, *, salvage: bool) -> Seen:
+    """Motion between all frames of a log, in the plane of the image."""
+    from sonar_graph.logs import read_sonar_frames
+    from sonar_graph.recognition import ImageMotions, one_by_one
+
+    motions = ImageMotions(calibration.model_copy(update={"floor": None}))
+    seen = Seen([], [], 0.0)
+    with progress_bars() as progress:
+        for block in read_sonar_frames(log, topic, salvage=salvage, refused=lambda *_: None):
+            seen = seen if seen.range_m else replace(seen, range_m=float(block.ranges_m.mean()))
+            for frame in one_by_one(block):
+                step = motions.look(frame)
+                seen.stamps_ns.append(int(frame.stamps_ns[0]))
+                seen.steps.extend([step] if step is not None else [])
+            progress("laying frames upon each other", len(seen.stamps_ns), 0)
+    return seen
+
+
+def require_overlap(
+    images: Path, navigation: Path, sequence: Sequence, seen: Seen, around_s: float, search_s: float
+) -> None:
+    """Refuse images and navigation without common time for any offset within the search."""
+    first_ns, last_ns = min(seen.stamps_ns), max(seen.stamps_ns)
+    low_ns, high_ns = (round((around_s + side * search_s) * NS_PER_S) for side in (-1, 1))
+    if first_ns + low_ns <= sequence.end_ns and last_ns + high_ns >= sequence.start_ns:
+        return
+    apart_s = (sequence.start_ns - first_ns) * 1e-9
+    raise LogError(
+        f"{images}: images from {instant(first_ns)} to {instant(last_ns)}; {navigation}: IMU and Doppler log from "
+        f"{instant(sequence.start_ns)} to {instant(sequence.end_ns)}: no common time"
+        f"{f' with an offset of {around_s:+.3f} s' if around_s else ''}; if the clocks differ, state by how much with "
+        f"--offset SECONDS ({apart_s:+.3f} would make both begin together), and --search SECONDS to refine it"
+    )
+
+
+def instant(stamp_ns: int) -> str:
+    """Seconds of a stamp, and its date where the clock counts since 1970."""
+    seconds = stamp_ns * 1e-9
+    is_dated = 1e8 < seconds < 1e11
+    return f"{seconds:.3f} s" + (f" ({datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M:%S} UTC)" if is_dated else "")
+
+
+def offset_of(
+    seen: Seen, sequence: Sequence, around_s: float, search_s: float, *, is_stated: bool
+) -> tuple[float, str]:
+    """Offset in seconds, and what is to be said of it."""
+    from sonar_graph.recognition import estimate_offset
+
+    estimate: ClockOffset | None = None
+    try:
+        with working("estimating the clock offset"):
+            estimate = estimate_offset(seen.steps, sequence, seen.range_m, around_s, search_s)
+    except LogError as error:
+        if not is_stated:
+            raise
+        return around_s, f"{around_s:+.3f} s, as stated; {str(error).rpartition('; ')[0]}"
+    if not is_stated:
+        return estimate.seconds, f"{estimate}"
+    is_doubted = abs(estimate.seconds - around_s) > DISAGREEING * estimate.sigma_s
+    warning = "; Warning: they do not agree, leave --offset out to take the images' own" if is_doubted else ""
+    return around_s, f"{around_s:+.3f} s, as stated; by the images {estimate}{warning}"
+
+
+def with_sonar_of(images: Calibration, recorded: str) -> str:
+    """Recorded calibration of the navigation, with what the recording of images knows of its sonar."""
+    known: dict[str, Any] = json.loads(recorded)
+    own = images.sonar.model_dump(mode="json", exclude_unset=True)
+    better = {name: own[name] for name in OF_THE_IMAGES if name in own}
+    return json.dumps(known | {"sonar": own | known.get("sonar", {}) | better})
+
+
+def on_the_clock(blocks: Iterator[SonarFrames], shift_ns: int, progress: Callable[[int], None]) -> Iterator[Outgoing]:
+    """Messages of blocks of frames with their stamps moved, in the order of time; a frame that is late is left out."""
+    from sonar_graph.logs import sonar_image_messages
+
+    latest_ns, done = -1, 0
+    for block in blocks:
+        late = block.stamps_ns <= latest_ns
+        if not late.all():
+            latest_ns, done = int(block.stamps_ns[-1]), done + len(block)
+            kept = replace(block, stamps_ns=block.stamps_ns[~late] + shift_ns, intensity=block.intensity[~late])
+            yield sonar_image_messages(TOPIC, kept)
+        progress(done)

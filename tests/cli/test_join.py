@@ -1,0 +1,113 @@
+"""``join``: images of one file, navigation of another."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sonar_graph.calibration import Calibration, SonarCalibration, SonarImage
+from sonar_graph.logs.mcap.writer import recording
+from sonar_graph.logs.reading import read_log, read_sonar_frames
+from sonar_graph.logs.vehicle_setup import METADATA, recorded_calibration
+from sonar_graph.logs.writing import sonar_image_messages, write_log
+from tests.logs.converters.sonar_recordings import Aris, images
+from tests.recognition.imaged_lane import TOPIC, Lane
+
+OFFSET_S = 2.4
+
+
+def images_log(lane: Lane, path: Path, offset_s: float = OFFSET_S) -> Path:
+    """The images by a clock that is behind, in a log that says what their samples mean."""
+    calibration = Calibration(sonar=SonarCalibration(image=SonarImage(decibel_span=75.0)))
+    frames = replace(lane.frames, stamps_ns=lane.frames.stamps_ns - round(offset_s * 1e9))
+    with recording(path, {METADATA: {"calibration": recorded_calibration(calibration)}}) as writer:
+        writer.write([sonar_image_messages(TOPIC, frames)])
+    return path
+
+
+@pytest.fixture(scope="module")
+def both(lane, tmp_path_factory) -> tuple[Path, Path]:
+    folder = tmp_path_factory.mktemp("two")
+    write_log(folder / "nav.mcap", lane.sequence)
+    return images_log(lane, folder / "images.mcap"), folder / "nav.mcap"
+
+
+def test_images_come_onto_the_clock_of_the_navigation_with_all_else_as_it_was(lane, both, run, tmp_path, capsys):
+    out = tmp_path / "joined.mcap"
+    assert run("join", *both, "-o", out) == 0
+    said = capsys.readouterr().out
+    match = re.search(r"Clock offset, to be added .*: \+(\d\.\d+) s ± (\d\.\d+) s", said)
+    assert abs(float(match[1]) - OFFSET_S) < 3 * float(match[2]) + 0.01
+    assert f"{len(lane.frames)} frames, " in said
+    joined = read_log(out)
+    np.testing.assert_array_equal(joined.imu.stamps_ns, lane.sequence.imu.stamps_ns)
+    blocks = list(read_sonar_frames(out))
+    stamps = np.concatenate([block.stamps_ns for block in blocks])
+    np.testing.assert_allclose(stamps, lane.frames.stamps_ns, atol=3e9 * float(match[2]) + 1e7)
+    np.testing.assert_array_equal(np.concatenate([block.intensity for block in blocks]), lane.frames.intensity)
+    assert joined.notes["images.clock_offset"].startswith(f"+{match[1]} s")
+    expected = lane.sequence.calibration
+    assert joined.calibration.sonar.mounting == expected.sonar.mounting
+    assert joined.calibration.sonar.image.decibel_span == 75.0
+    assert joined.calibration.model_copy(update={"sonar": expected.sonar}) == expected
+
+
+def test_a_stated_offset_is_taken_and_doubted_where_the_images_say_else(lane, both, run, tmp_path, capsys):
+    out = tmp_path / "joined.mcap"
+    assert run("join", *both, "-o", out, "--offset", OFFSET_S) == 0
+    said = capsys.readouterr().out
+    assert "+2.400 s, as stated; by the images +2.4" in said
+    assert "Warning" not in said
+    stamps = np.concatenate([block.stamps_ns for block in read_sonar_frames(out)])
+    np.testing.assert_array_equal(stamps, lane.frames.stamps_ns)
+    assert run("join", *both, "-o", out, "--offset", 3.5) == 0
+    assert "Warning: they do not agree" in capsys.readouterr().out
+
+
+def test_files_without_common_time_are_refused_with_the_offset_that_would_make_both_begin_together(
+    lane, both, run, tmp_path, capsys
+):
+    far = images_log(lane, tmp_path / "far.mcap", offset_s=1.2e9)
+    out = tmp_path / "joined.mcap"
+    assert run("join", far, both[1], "-o", out) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    found = re.search(
+        r"far\.mcap: images from 2\d+\.\d+ s .* UTC\); .*nav\.mcap: .*: no common time; .* \(\+(\d+\.\d+) would", line
+    )
+    assert found
+    assert not out.exists()
+    assert run("join", far, both[1], "-o", out, "--offset", float(found[1]), "--search", 3) == 0
+    refined = re.search(r": \+(\d+\.\d+) s ± (\d\.\d+) s", capsys.readouterr().out)
+    assert abs(float(refined[1]) - 1.2e9) < 3 * float(refined[2])
+
+
+def test_a_file_of_a_sonar_is_converted_and_what_cannot_tell_must_be_stated(both, run, tmp_path, capsys):
+    recorded = tmp_path / "dive.aris"
+    recorded.write_bytes(Aris(images(6, 128, 300)).content())
+    first_ns = next(read_sonar_frames(converted(run, recorded))).stamps_ns[0]
+    offset_s = (read_log(both[1]).start_ns - first_ns) * 1e-9 + 1.0
+    out = tmp_path / "joined.mcap"
+    assert run("join", recorded, both[1], "-o", out, "--offset", f"{offset_s:.6f}", "--search", 2) == 2
+    assert "steps between them could be measured, and 50 are needed; state it" in capsys.readouterr().err
+    assert run("join", recorded, both[1], "-o", out, "--offset", f"{offset_s:.6f}") == 0
+    assert "as stated; the images cannot tell" in capsys.readouterr().out
+    assert sum(len(block) for block in read_sonar_frames(out)) == 6
+    assert run("join", tmp_path / "dive.raw", both[1], "-o", out) == 2
+    (tmp_path / "dive.raw").write_bytes(b"x")
+    assert run("join", tmp_path / "dive.raw", both[1], "-o", out) == 2
+    assert "expected an .mcap, .aris or .ddf file" in capsys.readouterr().err
+
+
+def converted(run, recorded: Path) -> Path:
+    out = recorded.with_suffix(".mcap")
+    assert run("convert", "aris", recorded, "-o", out) == 0
+    return out
+
+
+def test_navigation_that_has_images_already_is_refused(lane_log, both, run, tmp_path, capsys):
+    assert run("join", both[0], lane_log, "-o", tmp_path / "joined.mcap") == 2
+    assert (
+        "/sonar/image (marine_acoustic_msgs/msg/ProjectedSonarImage) is in the log already" in capsys.readouterr().err
+    )
