@@ -7,7 +7,7 @@ import numpy as np
 
 from sonar_graph.measurements import Floats
 from sonar_graph.report.figure_style import MUTED, blank_panels, colour, name_axes
-from sonar_graph.sonar.bayes import jeffrey, virtual_evidence
+from sonar_graph.sonar.bayes import jeffrey
 
 Update = Callable[[Floats, Floats], Floats]
 """Belief after a frame, from the belief before it and the frame's scores; shapes (1, 4)."""
@@ -26,8 +26,14 @@ def rules(confusion: Floats) -> dict[str, Update]:
     """Both rules, by name; every frame counts in full."""
     return {
         "Jeffrey": lambda belief, scores: jeffrey(belief, scores, confusion),
-        "virtual evidence": lambda belief, scores: virtual_evidence(belief, scores, confusion, UNIFORM[0], np.ones(1)),
+        "virtual evidence": lambda belief, scores: virtual_evidence(belief, scores, confusion, np.ones(1)),
     }
+
+
+def virtual_evidence(predicted: Floats, scores: Floats, confusion: Floats, weights: Floats) -> Floats:
+    """Pearl's rule for scores whose prior is even: each frame multiplies the odds, to the power of its weight."""
+    odds = predicted * (scores @ confusion.T) ** weights[:, None]
+    return np.asarray(odds / odds.sum(axis=1, keepdims=True))
 
 
 def beliefs(update: Update, start: Floats, frames: Sequence[Floats]) -> list[float]:
@@ -77,7 +83,7 @@ def print_news(runs: int = 20_000, frames: int = 10, again: float = 0.9) -> None
         belief = np.full((runs, 4), 0.25)
         for n, look in enumerate(looks):
             weights = np.full(runs, weight if n else 1.0)
-            belief = virtual_evidence(belief, np.eye(4)[look], confusion, UNIFORM[0], weights)
+            belief = virtual_evidence(belief, np.eye(4)[look], confusion, weights)
         confidence, right = belief.max(axis=1).mean(), (belief.argmax(axis=1) == 0).mean()
         print(f"  {name:17s} mean confidence {confidence:.2f}, right {right:.2f}")
 

@@ -1,8 +1,9 @@
 """Measuring the model of recognition on logs with known truth: `sonar-graph calibrate`.
 
 Sightings are labelled by the true landmarks: within 8 cm of one it is that landmark, more than 40 cm from all it is
-none, in between (such as a piece of a landmark) it is left out. `estimate_confusion` then fits sharpness and threshold
-of the soft scores, the confusion matrix and the accuracy of range and azimuth. Derivation: docs/theory/recognition.md.
+none, in between (such as a piece of a landmark) it is left out. `estimate_confusion` then fits the weights of the
+evidence and the number of looks to whole tracks, the confusion matrix, and the accuracy of range and azimuth.
+Derivation: docs/theory/recognition.md.
 """
 
 from collections.abc import Sequence
@@ -10,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.optimize import brentq, minimize, minimize_scalar
-from scipy.special import expit
+from scipy.optimize import minimize
+from scipy.special import log_softmax
 
 from sonar_graph.devices import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.errors import CalibrationError, LogError
@@ -28,35 +29,42 @@ from sonar_graph.sonar import (
     RecogniserParams,
     mark_of,
     posterior_mean_rows,
+    read_confusion,
     soft_scores,
-    virtual_evidence,
 )
+from sonar_graph.sonar.bayes import IdentityParams
+from sonar_graph.sonar.confusion import SHIPPED
+from sonar_graph.sonar.figures import EVIDENCE
 
 SAME_M, APART_M = 0.08, 0.40
 NO_LABEL = -2
 NONE = -1
-LEAST_FRAMES = 20
+LEAST_FRAMES = 3
 """Labelled frames that every class needs."""
 MOST_CORRELATED = 0.99
 """Upper limit of the correlation: some 200 frames for each detection."""
-ONE_STANDARD_ERROR_NATS = 0.5
-"""Rise of the total loss at one sigma of a Gaussian likelihood."""
+PRIOR_SHARE = 0.25
+"""Standard deviation of a weight about that of the shipped model, as a share of it; and of the logarithm of looks."""
 
 
 @dataclass(frozen=True, eq=False)
 class LabelledFits:
     """Fits of designs to patches whose class is known."""
 
-    correlation: Floats
-    """Of each design with the patch, shape (n, ids)."""
+    evidence: Floats
+    """For each design, in the columns of `EVIDENCE`, shape (n, ids, 8)."""
     visible: Floats
     """Share of the template in view, shape (n,)."""
     label: Ints
     """Index of the true class; the number of ids for "none of them", shape (n,)."""
     track: Ints
     """Track of each patch, shape (n,); frames of one track are not independent."""
+    news: Floats
+    """Independent share of each frame of a track, shape (n,)."""
     range_azimuth_error: Floats
     """Measured minus true (m, rad), shape (n, 2); NaN where there is no landmark."""
+    range_per_height: Floats
+    """`ObjectSighting.range_per_height`, shape (n,)."""
 
 
 class LabelledSightings:
@@ -64,31 +72,40 @@ class LabelledSightings:
 
     def __init__(self, ids: tuple[int, ...]) -> None:
         self.ids = ids
-        self._rows: list[tuple[Floats, float, int, tuple[int, int], tuple[float, float]]] = []
+        self._rows: list[tuple[Floats, float, int, tuple[int, int], float, tuple[float, float], float]] = []
 
     def add(
-        self, sighting: ObjectSighting, track: tuple[int, int], ids: Ints, range_m: Floats, azimuth_rad: Floats
+        self,
+        sighting: ObjectSighting,
+        track: tuple[int, int],
+        news: float,
+        ids: Ints,
+        range_m: Floats,
+        azimuth_rad: Floats,
     ) -> None:
         """Add a sighting of a track (log, number), given the true range and azimuth of every landmark, shapes (m,)."""
         label, at = label_of(sighting, ids, range_m, azimuth_rad)
-        known = label != NONE
-        if sighting.fit is None or label == NO_LABEL or (known and label not in self.ids):
+        known, fit = label != NONE, sighting.fit
+        if fit is None or label == NO_LABEL or (known and label not in self.ids):
             return
         error = np.nan, np.nan
-        if known and sighting.is_fitted:
+        if known:
             error = sighting.range_m - range_m[at], sighting.azimuth_rad - azimuth_rad[at]
         row = self.ids.index(label) if known else len(self.ids)
-        self._rows.append((sighting.fit.correlation, sighting.fit.visible, row, track, error))
+        self._rows.append((fit.evidence, fit.visible, row, track, news, error, sighting.range_per_height))
 
     def fits(self) -> LabelledFits:
         """All of them as columns."""
-        correlation, visible, label, track, error = zip(*self._rows, strict=True) if self._rows else [()] * 5
+        columns = zip(*self._rows, strict=True) if self._rows else [()] * 7
+        evidence, visible, label, track, news, error, rise = columns
         return LabelledFits(
-            np.array(correlation, float).reshape(-1, len(self.ids)),
+            np.array(evidence, float).reshape(-1, len(self.ids), len(EVIDENCE)),
             np.array(visible, float),
             np.array(label, np.int64),
             np.unique(np.reshape(track, (-1, 2)), axis=0, return_inverse=True)[1].ravel(),
+            np.array(news, float),
             np.array(error, float).reshape(-1, 2),
+            np.array(rise, float),
         )
 
 
@@ -164,9 +181,10 @@ def calibrate(
             if recogniser.stamp_ns != stamp_ns or not truth.stamps_ns[0] <= stamp_ns <= truth.stamps_ns[-1]:
                 continue
             range_m, azimuth_rad = true_ranges_azimuths(run, stamp_ns)
-            for track, sighting in zip(recogniser.track_ids.tolist(), recogniser.sightings, strict=True):
+            tracks = zip(recogniser.track_ids.tolist(), recogniser.news.tolist(), recogniser.sightings, strict=True)
+            for track, news, sighting in tracks:
                 if sighting is not None:
-                    gathered.add(sighting, (log, track), run.true_landmarks.ids, range_m, azimuth_rad)
+                    gathered.add(sighting, (log, track), news, run.true_landmarks.ids, range_m, azimuth_rad)
         if not session.result.frames:
             raise LogError(no_images(path))
     names = spelt(", ".join(path.name for path, _ in logs))
@@ -191,36 +209,55 @@ def estimate_confusion(
             f"too few labelled frames ({'; '.join(poor)}; needed {LEAST_FRAMES} of each): give longer or more logs"
         )
     tracks = np.array([len(np.unique(fits.track[fits.label == k])) for k in range(len(counts))])
-    trials = np.append(np.full(len(ids), tracks[:-1].sum()), tracks[-1])  # landmarks share the two fitted numbers
-    targets = posterior_mean_rows(np.eye(len(counts)), trials)
-    targets = targets[fits.label] / (counts[fits.label] * len(counts))[:, None]
-    sharpness, threshold = fit_scores(fits, targets, trials, int(tracks.sum()))
-    matrix = confusion_rows(soft_scores(fits.correlation, fits.visible, sharpness, threshold), fits.label, trials)
-    sigmas = np.sqrt(np.nanmean((fits.range_azimuth_error * fits.visible[:, None] ** 2) ** 2, axis=0))
+    trials = np.append(np.full(len(ids), tracks[:-1].sum()), tracks[-1])  # landmarks share the weights
+    shipped = read_confusion(SHIPPED)
+    weights, looks = fit_weights(fits, np.array(shipped.weights), shipped.looks)
+    odds = np.pad(fits.evidence @ weights, ((0, 0), (0, 1)))
+    matrix = confusion_rows(soft_scores(odds, looks), fits.label, trials)
+    height_bias_m, error = without_height(fits)
+    sigmas = np.sqrt(np.nanmean((error * fits.visible[:, None] ** 2) ** 2, axis=0))
     return Confusion(
         ids=ids,
         designs=tuple(map(mark_of, designs)),
         matrix=tuple(map(tuple, matrix.tolist())),
-        sharpness=sharpness,
-        threshold=threshold,
+        weights=tuple(weights.tolist()),
+        looks=looks,
+        doubt=shipped.doubt,
         range_sigma_m=float(sigmas[0]),
         azimuth_sigma_rad=float(sigmas[1]),
-        error_correlation=error_correlation(fits),
+        height_bias_m=height_bias_m,
+        error_correlation=error_correlation(error, fits.track),
         provenance=provenance
         | {f"frames of {n}": str(c) for n, c in zip(names, counts.tolist(), strict=True)}
         | {f"tracks of {n}": str(c) for n, c in zip(names, tracks.tolist(), strict=True)},
     )
 
 
-def error_correlation(fits: LabelledFits) -> float:
+def without_height(fits: LabelledFits) -> tuple[float, Floats]:
+    """Height of the faces over the true landmarks, by least squares on the errors of range, and the errors without it.
+
+    A face that is higher by b seems nearer by ``b h / r``, with h the height of the sonar: where sound arrives first.
+    Each track counts once.
+    """
+    error, rise = fits.range_azimuth_error.copy(), fits.range_per_height
+    known = np.isfinite(error[:, 0]) & (rise > 0)
+    if not known.any():
+        return 0.0, error
+    once = 1.0 / np.bincount(fits.track)[fits.track]
+    bias_m = -float(np.sum((once * rise * error[:, 0])[known]) / np.sum((once * rise**2)[known]))
+    error[:, 0] += bias_m * rise
+    return bias_m, error
+
+
+def error_correlation(error: Floats, track_of: Ints) -> float:
     """Correlation of the errors of a track's successive frames, at least 0: the mean of range's and azimuth's.
 
     No mean is taken from the errors: one that all frames of a track share is what they have in common.
     """
-    error, known = fits.range_azimuth_error, np.isfinite(fits.range_azimuth_error).all(axis=1)
+    known = np.isfinite(error).all(axis=1)
     products, squares = np.zeros(2), np.zeros(2)
-    for track in np.unique(fits.track[known]):
-        own = error[known & (fits.track == track)]
+    for track in np.unique(track_of[known]):
+        own = error[known & (track_of == track)]
         products += (own[1:] * own[:-1]).sum(axis=0)
         squares += 0.5 * (own[1:] ** 2 + own[:-1] ** 2).sum(axis=0)
     return float(np.clip(np.mean(products / np.maximum(squares, np.finfo(float).tiny)), 0.0, MOST_CORRELATED))
@@ -235,35 +272,42 @@ def confusion_rows(scores: Floats, label: Ints, trials: Ints) -> Floats:
     return posterior_mean_rows(means, trials)
 
 
-def fit_scores(fits: LabelledFits, targets: Floats, trials: Ints, tracks: int) -> tuple[float, float]:
-    """Sharpness and threshold for which the posterior of one frame fits weighted targets, shape (n, classes).
+def fit_weights(fits: LabelledFits, prior: Floats, prior_looks: float) -> tuple[Floats, float]:
+    """Weights of the evidence and number of looks with which the posteriors of tracks fit their classes.
 
-    The posterior counts, after the confusion matrix and from equal priors: doubt in the scores would count twice.
-    Where nothing was ever confused, any large sharpness fits. So the least sharpness is taken whose loss is within one
-    standard error of the best, each track counting as one observation (Breiman et al. 1984, section 3.4.3).
+    Conditional logit (McFadden 1974) of whole tracks. Landmarks and none of them begin with the prior of a recogniser,
+    and count by it, however many tracks there are of each. The weights are the most probable ones under a normal prior
+    about those given, with `PRIOR_SHARE`: a few tracks of one scene move them little.
     """
-    classes = targets.shape[1]
-    equal, news = np.full((len(targets), classes), 1.0 / classes), np.ones(len(targets))
+    sums, counted, label, share = track_sums(fits)
+    classes = fits.evidence.shape[1] + 1
+    log_birth = np.log(IdentityParams().birth(classes - 1))
+    scale = PRIOR_SHARE * np.abs(prior)
 
-    def loss(log_sharpness: float, logit: float) -> float:
-        scores = soft_scores(fits.correlation, fits.visible, float(np.exp(log_sharpness)), float(expit(logit)))
-        matrix = confusion_rows(scores, fits.label, trials)
-        posterior = virtual_evidence(equal, scores, matrix, matrix.mean(axis=0), news)
-        return float(-np.sum(targets * np.log(np.maximum(posterior, 1e-12))))
+    def loss(unbounded: Floats) -> float:
+        weights, looks = prior + scale * unbounded[:-1], prior_looks * np.exp(PRIOR_SHARE * unbounded[-1])
+        odds = np.pad(sums @ weights, ((0, 0), (0, 1))) / (counted + looks)[:, None]
+        log_posterior = log_softmax(odds + log_birth, axis=1)
+        return float(0.5 * unbounded @ unbounded - share @ log_posterior[np.arange(len(label)), label])
 
-    def loss_of_both(unbounded: Floats) -> float:
-        return loss(float(unbounded[0]), float(unbounded[1]))
+    best = minimize(loss, np.zeros(len(prior) + 1), method="L-BFGS-B").x
+    return prior + scale * best[:-1], float(prior_looks * np.exp(PRIOR_SHARE * best[-1]))
 
-    best = minimize(loss_of_both, np.array([np.log(10.0), 1.0]), method="Nelder-Mead")
-    allowed = best.fun + ONE_STANDARD_ERROR_NATS / tracks
 
-    def least(log_sharpness: float) -> tuple[float, float]:
-        """Loss and logit of the best threshold for a sharpness."""
-        found = minimize_scalar(lambda x: loss(log_sharpness, x), bounds=(-2.0, 5.0), method="bounded")
-        return float(found.fun), float(found.x)
+def track_sums(fits: LabelledFits) -> tuple[Floats, Floats, Ints, Floats]:
+    """Sums of evidence and of news over tracks, the class of each, and how much it counts.
 
-    blunt = float(best.x[0]) - 1.0
-    while least(blunt)[0] <= allowed:
-        blunt -= 1.0
-    chosen = float(brentq(lambda x: least(x)[0] - allowed, blunt, float(best.x[0]), xtol=1e-3))
-    return float(np.exp(chosen)), float(expit(least(chosen)[1]))
+    A track that was of several classes is one of each. Landmarks and none of them have the shares of the prior in sum.
+    """
+    sums, counted, label = [], [], []
+    for track, k in np.unique(np.stack([fits.track, fits.label]), axis=1).T.tolist():
+        rows = np.flatnonzero((fits.track == track) & (fits.label == k) & (fits.news > 0))
+        if len(rows):
+            sums.append(np.einsum("n,nke->ke", fits.news[rows], fits.evidence[rows]))
+            counted.append(fits.news[rows].sum())
+            label.append(k)
+    labels = np.array(label)
+    of_none = labels == fits.evidence.shape[1]
+    unknown = IdentityParams().unknown_prior
+    shares = np.where(of_none, unknown / max(of_none.sum(), 1), (1 - unknown) / max((~of_none).sum(), 1)) * len(labels)
+    return np.array(sums), np.array(counted), labels, shares

@@ -1,14 +1,15 @@
-"""Appearance of candidates: correlation of the image around them with every design, at all headings and small shifts.
+"""Appearance of candidates: best place and heading of every design in the image around them, and what speaks for it.
 
-The image is sampled on a square grid of the floor, where foreshortening and the shape of the fan drop out. Designs are
-templates on the same grid (`sonar_graph.sonar.templates`). The correlation c over the cells in view does not depend on
-gain or on the level of the floor. How far speckle lowers it depends on the design's contrast and on the bins, and is
-corrected. Derivation: docs/theory/recognition.md.
+The image is sampled on a square grid of the floor, where foreshortening and the shape of the fan drop out; its x axis
+points away from the sonar, along the line of sight. Designs are templates on the same grid
+(`sonar_graph.sonar.templates`), and the correlation with them finds place and heading. What speaks for a design there,
+against anything else, is `sonar_graph.sonar.figures`. Derivation: docs/theory/recognition.md.
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from pydantic import Field
@@ -18,11 +19,14 @@ from sonar_graph.devices import LandmarkDesign
 from sonar_graph.images import SonarFrames
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.numerics import compiled
-from sonar_graph.sonar.confusion import STANDARD_ATTENUATION, Confusion, soft_scores
+from sonar_graph.sonar.confusion import Confusion
+from sonar_graph.sonar.figures import Figures
 from sonar_graph.sonar.geometry import FloorView
 from sonar_graph.sonar.regions import Candidates
 from sonar_graph.sonar.templates import Floats32, Patch, PolarGrid, Templates
 
+COARSE = 2
+"""Cells between the shifts from which the search climbs to the best one."""
 MOST_MULTIPLICATIONS = 250_000
 """OpenBLAS uses several cores from 262,144 on."""
 
@@ -48,17 +52,14 @@ class AppearanceParams(Section):
 class DesignFit:
     """Fit of each design to a patch."""
 
-    correlation: Floats
-    """Best over headings and shifts, shape (designs,); negative where too little is visible. That of a sighting is
-    corrected for attenuation by speckle, and may exceed 1."""
+    evidence: Floats
+    """What speaks for each design, in the columns of `sonar_graph.sonar.figures.EVIDENCE`, shape (designs, 8)."""
     visible: float
     """Share of the cells in view at the best fit of all."""
-    best: int
-    """Design with the highest correlation."""
-    heading_rad: float
-    """Heading of that design's x axis against the floor's."""
+    heading_rad: Floats
+    """Heading of each design's x axis against the floor's, shape (designs,)."""
     centre_m: Floats
-    """(x, y) of that design's centre on the floor, between the grid's points, shape (2,)."""
+    """(x, y) of each design's centre on the floor, between the grid's points, shape (designs, 2)."""
 
 
 class Appearance:
@@ -68,45 +69,41 @@ class Appearance:
         self.params = params or AppearanceParams()
         self.templates = Templates.of(designs, self.params.cell_m, self.params.margin_m, self.params.blur_m)
         self.designs = len(designs)
+        self.figures = Figures(designs, self.templates, self.params.blur_m)
         self._steps = math.ceil(self.params.search_m / self.params.cell_m)
-        self.patch_side = self.templates.side + 2 * self._steps
+        self.patch_side = 2 * (self.figures.half + self._steps) + 1
+        self._rim = self.figures.half - self.templates.side // 2
         x, y = np.divmod(self.templates.cells, self.templates.side)
-        steps = np.arange(2 * self._steps + 1)
+        steps = np.arange(0, 2 * self._steps + 1, COARSE)
         self._shifts = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
-        self._cells, self._offsets = x * self.patch_side + y, self._shifts @ np.array([self.patch_side, 1])
+        self._cells = (x + self._rim) * self.patch_side + y + self._rim
+        self._offsets = self._shifts @ np.array([self.patch_side, 1])
         pictures = self.templates.pictures
         self._pictures, self._squares = np.ascontiguousarray(pictures.T), np.ascontiguousarray(pictures.T**2)
         self._sums = self._pictures.sum(axis=0), self._squares.sum(axis=0)
-        self._first_of_design = np.searchsorted(self.templates.design, np.arange(self.designs))
-        self._variance_db2 = np.add.reduceat(pictures.var(axis=1), self._first_of_design)
-        self._variance_db2 /= np.bincount(self.templates.design)
+        self._first_of_design = np.searchsorted(self.templates.design, np.arange(self.designs + 1)).tolist()
 
-    def fit(self, patch: Patch) -> DesignFit:
-        """Fit of the designs at their best headings and shifts."""
+    def fit(self, patch: Patch) -> DesignFit | None:
+        """Fit of the designs, each at its best heading and shift; None where too little is in view."""
         seen = windows(patch.seen.ravel(), self._cells, self._offsets)
         visible = seen.sum(axis=1) / np.float32(len(self._cells))
         at = self._correlations(patch, seen, visible)
-        best_shift, best_template = divmod(int(np.argmax(at)), at.shape[1])
-        side = 2 * self._steps + 1
-        surface = at[:, best_template].reshape(side, side)
-        x, y = divmod(best_shift, side)
-        offset = np.array([parabola_top(surface[:, y], x), parabola_top(surface[x, :], y)])
-        by_design = np.maximum.reduceat(at.max(axis=0), self._first_of_design)
-        share = float(visible[best_shift])
-        return DesignFit(
-            by_design if share >= self.params.least_visible else np.full_like(by_design, -1.0),
-            share,
-            int(self.templates.design[best_template]),
-            float(self.templates.heading_rad[best_template]),
-            patch.centre_m + self.params.cell_m * (self._shifts[best_shift] - self._steps + offset),
-        )
-
-    def attenuation(self, bin_m: float) -> Floats:
-        """Correlation of a patch with its own design that speckle leaves, shape (designs,), in bins of a length.
-
-        A template of variance V plus noise of variance N correlates with the template by ``sqrt(V / (V + N))``.
-        """
-        return np.asarray(np.sqrt(self._variance_db2 / (self._variance_db2 + noise_db2(self.params.cell_m, bin_m))))
+        share = float(visible[int(np.argmax(at)) // at.shape[1]])
+        if share < self.params.least_visible:
+            return None
+        level = centred(patch)
+        evidence, headings, centres = [], [], []
+        for first, last in pairwise(self._first_of_design):
+            shift, template = divmod(int(np.argmax(at[:, first:last])), last - first)
+            start, picture = self._shifts[shift], self.templates.pictures[first + template]
+            x, y, offset = climbed(level, patch.seen, self._cells, picture, start, 2 * self._steps)
+            found = self.figures.evidence(patch, first + template, (x, y))
+            if found is None:
+                return None
+            evidence.append(found)
+            headings.append(self.templates.heading_rad[first + template])
+            centres.append(patch.centre_m + self.params.cell_m * (np.array([x, y]) - self._steps + offset))
+        return DesignFit(np.array(evidence), share, np.array(headings), np.array(centres))
 
     def _correlations(self, patch: Patch, seen: Floats32, visible: Floats32) -> Floats32:
         """Correlation of each shift with each template, shape (shifts, templates); -1 where too little is visible."""
@@ -115,9 +112,7 @@ class Appearance:
         if not len(shifts):
             return correlation
         n = (visible[shifts] * len(self._cells))[:, None]
-        # levels over their mean, 0 where nothing is seen: sums of small numbers are exact enough in 32 bits
-        centred = (patch.level_db - patch.level_db.sum() / max(patch.seen.sum(), 1.0)) * patch.seen
-        level = windows(centred.ravel(), self._cells, self._offsets[shifts])
+        level = windows(centred(patch).ravel(), self._cells, self._offsets[shifts])
         total, square = (np.tile(whole, (len(shifts), 1)) for whole in self._sums)
         cut = np.flatnonzero(visible[shifts] < 1)
         if len(cut):
@@ -150,27 +145,58 @@ def matmul(rows: Floats32, columns: Floats32) -> Floats32:
     return product
 
 
-def parabola_top(values: Floats32, at: int) -> float:
-    """Offset of the top of the parabola through the highest value and its neighbours; 0 at an end."""
-    if not 0 < at < len(values) - 1:
-        return 0.0
-    before, here, after = (float(v) for v in values[at - 1 : at + 2])
+def centred(patch: Patch) -> Floats32:
+    """Levels over their mean, 0 where nothing is seen: sums of small numbers are exact enough in 32 bits."""
+    return np.asarray((patch.level_db - patch.level_db.sum() / max(patch.seen.sum(), 1.0)) * patch.seen)
+
+
+@compiled
+def climbed(
+    level: Floats32, seen: Floats32, cells: Ints, picture: Floats32, start: Ints, last: int
+) -> tuple[int, int, Floats]:
+    """Shift in x and y at which a template correlates best, uphill from a start, and the top of the parabola there.
+
+    Shifts lie between 0 and ``last``; the top is an offset of at most one half along each axis, 0 at an end.
+    """
+    side, levels, seens = level.shape[1], level.ravel(), seen.ravel()
+    known = np.full((last + 1, last + 1), np.nan)
+    x, y, moved = start[0], start[1], True
+    while moved:
+        moved = False
+        for dx, dy in ((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)):
+            i, j = x + dx, y + dy
+            if 0 <= i <= last and 0 <= j <= last and np.isnan(known[i, j]):
+                known[i, j] = correlation(levels, seens, cells, i * side + j, picture)
+        for dx, dy in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+            i, j = x + dx, y + dy
+            if 0 <= i <= last and 0 <= j <= last and known[i, j] > known[x, y]:
+                x, y, moved = i, j, True
+                break
+    offset = np.zeros(2)
+    if 0 < x < last:
+        offset[0] = parabola_top(known[x - 1, y], known[x, y], known[x + 1, y])
+    if 0 < y < last:
+        offset[1] = parabola_top(known[x, y - 1], known[x, y], known[x, y + 1])
+    return x, y, offset
+
+
+@compiled
+def correlation(level: Floats32, seen: Floats32, cells: Ints, offset: int, picture: Floats32) -> float:
+    """Correlation of a template with the seen cells of a patch."""
+    n, a, b, aa, bb, ab = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for c in range(len(cells)):
+        if seen[cells[c] + offset] > 0:
+            one, other = level[cells[c] + offset], picture[c]
+            n, a, b, aa, bb, ab = n + 1, a + one, b + other, aa + one * one, bb + other * other, ab + one * other
+    scale2 = (n * aa - a * a) * (n * bb - b * b)
+    return (n * ab - a * b) / math.sqrt(scale2) if scale2 > 0 else -1.0
+
+
+@compiled
+def parabola_top(before: float, here: float, after: float) -> float:
+    """Offset of the top of the parabola through a value and its neighbours, which are not higher."""
     bend = before - 2 * here + after
     return 0.5 * (before - after) / bend if bend < 0 else 0.0
-
-
-ONE_LOOK_DB2 = (10 / math.log(10)) ** 2 * math.pi**2 / 6
-"""Variance of the level of speckle of one look."""
-BINS_A_LOOK = 1.64
-"""Length of a pulse: 4 mm in bins of 2.44 mm."""
-TEXTURE_DB2 = 6.7
-"""Variance of a cell that looks do not average out. Measured on a simulated basin: what the shipped designs leave
-unexplained in their own patches (15.0), without its speckle."""
-
-
-def noise_db2(cell_m: float, bin_m: float) -> float:
-    """Variance of the level of a cell that shows an even floor, dB squared."""
-    return ONE_LOOK_DB2 / max(1.0, cell_m / (BINS_A_LOOK * bin_m)) + TEXTURE_DB2
 
 
 CENTROID_SIGMA_M = 0.04
@@ -189,8 +215,8 @@ class ObjectSighting:
     azimuth_rad: float
     covariance: Floats
     """Of range and azimuth, shape (2, 2)."""
-    is_fitted: bool = False
-    """Range and azimuth are those of a design's centre, not of the candidate's centroid."""
+    range_per_height: float = 0.0
+    """Metres of range by which the landmark's face seems nearer for each metre that it is higher; 0: not known."""
 
 
 class CandidateFit:
@@ -200,7 +226,6 @@ class CandidateFit:
         self._appearance, self._confusion = appearance, confusion
         self._aperture_rad = elevation_aperture_rad
         self._grid: PolarGrid | None = None
-        self._correction = np.ones(appearance.designs)
         self._shape: tuple[Floats, Floats] = np.empty(0), np.empty(0)
 
     def at(
@@ -211,35 +236,43 @@ class CandidateFit:
         is_same = (one is other or np.array_equal(one, other) for one, other in zip(self._shape, shape, strict=True))
         if self._grid is None or not all(is_same):
             self._grid, self._shape = PolarGrid.of(*shape, self._aperture_rad), shape
-            self._correction = STANDARD_ATTENUATION / self._appearance.attenuation(self._grid.bin_m)
-        view, appearance = view or SLANT_PLANE, self._appearance
-        sightings: list[ObjectSighting | None] = []
-        for row in rows.tolist():
-            if row < 0:
-                sightings.append(None)
-                continue
-            range_m, azimuth_rad = float(candidates.range_m[row]), float(candidates.azimuth_rad[row])
-            centroid_cov = np.diag(np.square([CENTROID_SIGMA_M, CENTROID_SIGMA_M / range_m]))
-            sighting = ObjectSighting(None, range_m, azimuth_rad, centroid_cov)
-            centre = view.floor_point(range_m, azimuth_rad)
-            if centre is not None:
-                side, cell_m = appearance.patch_side, appearance.params.cell_m
-                fit = appearance.fit(self._grid.patch(image_db, view, centre, side, cell_m))
-                fit = replace(fit, correlation=fit.correlation * self._correction)
-                best = fit.correlation.max()
-                if best >= self._confusion.threshold:
-                    covariance = self._confusion.range_azimuth_cov(fit.visible)
-                    sighting = ObjectSighting(fit, *view.range_azimuth(fit.centre_m), covariance, is_fitted=True)
-                elif best >= 0:
-                    sighting = replace(sighting, fit=fit)
-            sightings.append(sighting)
-        return sightings
+        return [
+            None
+            if row < 0
+            else self._sighting(image_db, view, float(candidates.range_m[row]), float(candidates.azimuth_rad[row]))
+            for row in rows.tolist()
+        ]
 
-    def scores(self, sightings: Sequence[ObjectSighting | None]) -> Floats:
-        """Soft scores of the features, shape (M, designs + 1); rows of 0 where nothing was compared."""
-        scores, model = np.zeros((len(sightings), self._appearance.designs + 1)), self._confusion
+    def _sighting(
+        self, image_db: Floats32, view: FloorView | None, range_m: float, azimuth_rad: float
+    ) -> ObjectSighting:
+        """Sighting of a candidate with its centroid at a range and azimuth: where the best design's centre is."""
+        assert self._grid is not None
+        plane, model, appearance = view or SLANT_PLANE, self._confusion, self._appearance
+        centroid = ObjectSighting(
+            None, range_m, azimuth_rad, np.diag(np.square([CENTROID_SIGMA_M, CENTROID_SIGMA_M / range_m]))
+        )
+        centre = plane.floor_point(range_m, azimuth_rad)
+        if centre is None:
+            return centroid
+        ahead = plane.turned(math.atan2(centre[1], centre[0]))
+        at = np.array([np.hypot(*centre), 0.0])
+        fit = appearance.fit(self._grid.patch(image_db, ahead, at, appearance.patch_side, appearance.params.cell_m))
+        if fit is None:
+            return centroid
+        best = int(np.argmax(model.log_odds(fit.evidence)))
+        range_m, azimuth_rad = ahead.range_azimuth(fit.centre_m[best])
+        rise = 0.0 if view is None else view.height_m / range_m
+        covariance = model.range_azimuth_cov(fit.visible)
+        return ObjectSighting(fit, range_m + model.height_bias_m * rise, azimuth_rad, covariance, rise)
+
+    def log_odds(self, sightings: Sequence[ObjectSighting | None]) -> Floats:
+        """Log odds of each design against none of them, last 0 for these, shape (M, designs + 1).
+
+        Of a track that ends looking like this; rows of NaN where nothing was compared.
+        """
+        odds = np.full((len(sightings), self._appearance.designs + 1), np.nan)
         for row, sighting in enumerate(sightings):
-            if sighting is not None and (fit := sighting.fit) is not None:
-                found = soft_scores(fit.correlation[None], np.array([fit.visible]), model.sharpness, model.threshold)
-                scores[row] = found[0]
-        return scores
+            if sighting is not None and sighting.fit is not None:
+                odds[row] = np.append(self._confusion.log_odds(sighting.fit.evidence), 0.0)
+        return odds

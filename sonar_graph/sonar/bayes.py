@@ -10,12 +10,13 @@ of the 2014 paper, section II-B::
     (2)   p[m, k | j] = C[k, j] b'[m, k] / sum_i C[i, j] b'[m, i]
     (3)   b[m, k] = sum_j p[m, k | j] s[m, j]
 
-(2) and (3) are Jeffrey's rule: `jeffrey`. Ours is tempered virtual evidence (Pearl's rule): `virtual_evidence`,
+(2) and (3) are Jeffrey's rule: `jeffrey`. Ours is bounded evidence: `bounded_evidence`. With the log odds l of a
+frame, its independent share 0 <= w <= 1 (`news_of_motion`), and the sums over the frames of a track, carried by A,
 
-    b[m, k]  ~  b'[m, k] ( sum_j C[k, j] s[m, j] / base[j] )^weight[m]
+    L[m] = sum_j A[m, j] L[j] + w[m] l[m],    W[m] = sum_j A[m, j] W[j] + w[m]
+    b[m]  =  (1 - doubt) p[m] + doubt birth,    p[m, k]  ~  birth[k] exp( L[m, k] / (W[m] + looks) )
 
-with base the share of each feature in the prior of the scores, and 0 <= weight <= 1 the independent share of the frame
-(`news_of_motion`). Comparison of both rules, and sources: docs/theory/recognition.md.
+Comparison of both rules, and sources: docs/theory/recognition.md.
 """
 
 from collections.abc import Sequence
@@ -26,12 +27,10 @@ from pydantic import Field
 
 from sonar_graph.calibration import Section
 from sonar_graph.measurements import Floats
-from sonar_graph.sonar.confusion import Confusion
+from sonar_graph.sonar.confusion import Confusion, soft_scores
 from sonar_graph.sonar.track_filter import Association
 
 Rule = Literal["virtual-evidence", "jeffrey"]
-LEAST_PROBABILITY = 1e-12
-"""Floor of beliefs: from 0 no evidence leads back."""
 
 
 def predict(beliefs: Floats, association: Floats, birth: Floats, forgetting: Floats | float = 1e-3) -> Floats:
@@ -55,17 +54,16 @@ def jeffrey(predicted: Floats, scores: Floats, confusion: Floats) -> Floats:
     return np.where(scores.any(axis=1, keepdims=True), posterior, predicted)
 
 
-def virtual_evidence(predicted: Floats, scores: Floats, confusion: Floats, base: Floats, weights: Floats) -> Floats:
-    """Update beliefs by tempered virtual evidence: each frame multiplies the odds.
+def bounded_evidence(birth: Floats, log_odds: Floats, counted: Floats, looks: float, doubt: float) -> Floats:
+    """Beliefs from weighted sums of log odds, shape (M, K), and of the weights, shape (M,).
 
-    A row of zero scores, or a weight of 0, keeps the prediction. Shapes: base (J,), weights (M,).
+    The mean of the log odds counts, times a share that comes near to 1 with the number of looks: the mismatch between
+    a landmark and its design is the same in every frame, so that no number of them makes certain. A share of doubt is
+    left for tracks whose looks tell nothing.
     """
-    likelihood = (scores / base) @ confusion.T
-    measured = likelihood.max(axis=1, keepdims=True, initial=0.0) > 0
-    log_likelihood = np.log(np.maximum(np.where(measured, likelihood, 1.0), LEAST_PROBABILITY))
-    log_posterior = np.log(np.maximum(predicted, LEAST_PROBABILITY)) + weights[:, None] * log_likelihood
-    odds = np.exp(log_posterior - log_posterior.max(axis=1, keepdims=True))
-    return np.where(measured, odds / odds.sum(axis=1, keepdims=True), predicted)
+    log_belief = np.log(birth) + log_odds / (counted + looks)[:, None]
+    odds = np.exp(log_belief - log_belief.max(axis=1, keepdims=True))
+    return np.asarray((1 - doubt) * odds / odds.sum(axis=1, keepdims=True) + doubt * birth)
 
 
 def news_of_motion(moved_m: Floats, aperture_m: float) -> Floats:
@@ -88,13 +86,11 @@ class IdentityParams(Section):
     """Settings of the identity estimate."""
 
     rule: Rule = "virtual-evidence"
-    """virtual-evidence: ours; jeffrey: the 2014 paper's equations as printed, every frame counting in full."""
-    unknown_prior: float = Field(0.5, gt=0, lt=1)
-    """Belief in "none of them" about a new track."""
+    """virtual-evidence: ours, bounded; jeffrey: the 2014 paper's equations as printed, every frame counting in full."""
+    unknown_prior: float = Field(2 / 3, gt=0, lt=1)
+    """Belief in "none of them" about a new track: two unknown objects for each landmark."""
     forgetting: float = Field(1e-4, ge=0, lt=1)
-    """Share of a belief that returns to that of a new track, per independent frame."""
-    temper: float = Field(1.0, gt=0, le=1)
-    """Weight of an independent frame; below 1 where the appearance is less certain than was measured."""
+    """Share of a belief that returns to that of a new track, per frame; of the rule jeffrey only."""
     least_news: float = Field(0.1, ge=0, lt=1)
     """Frames with a smaller independent share are left out; motion adds up until the next one counts."""
     aperture_m: float = Field(0.14, gt=0)
@@ -104,6 +100,10 @@ class IdentityParams(Section):
     seeds 1001 to 1003, not derived."""
     most_looks: int = Field(64, ge=1)
     """Sonar positions remembered for each track."""
+
+    def birth(self, landmarks: int) -> Floats:
+        """Belief about a new track, shape (landmarks + 1,)."""
+        return np.append(np.full(landmarks, (1 - self.unknown_prior) / landmarks), self.unknown_prior)
 
 
 class Beliefs:
@@ -115,36 +115,42 @@ class Beliefs:
 
     def __init__(self, confusion: Confusion, params: IdentityParams | None = None) -> None:
         self.params = params or IdentityParams()
-        self._matrix, self._base = confusion.array(), confusion.base()
+        self._model = confusion
         known = len(confusion.ids)
-        self._birth = np.append(np.full(known, (1 - self.params.unknown_prior) / known), self.params.unknown_prior)
+        self._birth = self.params.birth(known)
         self._order: list[int] = []
-        self._beliefs: Floats = np.empty((0, known + 1))
+        self._beliefs, self._log_odds = np.empty((2, 0, known + 1))
+        self._counted = np.empty(0)
+        self.weights: Floats = np.empty(0)
+        """Independent share of the last frame for each track, shape (M,)."""
         self._looks: dict[int, list[Floats]] = {}
 
     def step(
-        self, association: Association, scores: Floats, places: Sequence[Floats | None], sideways: Floats
+        self, association: Association, log_odds: Floats, places: Sequence[Floats | None], sideways: Floats
     ) -> Floats:
-        """Predict and update for one frame, equations (1) to (3); the beliefs after it, shape (M, K).
+        """Predict and update for one frame; the beliefs after it, shape (M, K).
 
-        Where a track was looked at, ``places`` has the position of the sonar in a fixed frame, shape (3,), else None;
-        ``sideways`` is the horizontal unit vector across each line of sight in the same frame, shape (M, 3).
+        Log odds of the classes, shape (M, K), the last one's 0. Where a track was looked at, ``places`` has the
+        position of the sonar in a fixed frame, shape (3,), else None; ``sideways`` is the horizontal unit vector across
+        each line of sight in the same frame, shape (M, 3).
         """
         rows = [self._order.index(track) for track in association.previous_ids.tolist()]
         self._order = association.ids.tolist()
-        weights = np.array([self._weight(*look) for look in zip(self._order, places, sideways, strict=True)])
-        forgetting = self.params.forgetting * weights[:, None]
-        predicted = predict(self._beliefs[rows], association.matrix, self._birth, forgetting)
-        scores = np.where(weights[:, None] > 0, scores, 0.0)
-        if self.params.rule == "jeffrey":
-            self._beliefs = jeffrey(predicted, scores, self._matrix)
-        else:
-            self._beliefs = virtual_evidence(predicted, scores, self._matrix, self._base, weights)
+        self.weights = np.array([self._weight(*look) for look in zip(self._order, places, sideways, strict=True)])
+        known = np.where(self.weights[:, None] > 0, log_odds, 0.0)
         self._looks = {track: looks for track, looks in self._looks.items() if track in self._order}
-        return self._beliefs
+        if self.params.rule == "jeffrey":
+            predicted = predict(self._beliefs[rows], association.matrix, self._birth, self.params.forgetting)
+            scores = np.where(self.weights[:, None] > 0, soft_scores(known, self._model.looks), 0.0)
+            self._beliefs = jeffrey(predicted, scores, self._model.array())
+            return self._beliefs
+        carried = association.matrix[:, :-1]
+        self._log_odds = carried @ self._log_odds[rows] + self.weights[:, None] * known
+        self._counted = carried @ self._counted[rows] + self.weights
+        return bounded_evidence(self._birth, self._log_odds, self._counted, self._model.looks, self._model.doubt)
 
     def _weight(self, track: int, place: Floats | None, sideways: Floats) -> float:
-        """Independent share of a look, times the temper; 0: left out. Remembers the place of one that counts."""
+        """Independent share of a look; 0: left out. Remembers the place of one that counts."""
         if place is None:
             return 0.0
         if self.params.rule == "jeffrey":
@@ -161,4 +167,4 @@ class Beliefs:
             return 0.0
         looks.append(place)
         del looks[: -self.params.most_looks]
-        return self.params.temper * news
+        return news

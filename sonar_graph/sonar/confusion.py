@@ -1,11 +1,14 @@
-"""Measured model of recognition: soft scores of the features, and how often each landmark shows each feature.
+"""Measured model of recognition: how much each piece of evidence counts, and how often landmarks look like which.
 
-Classes and features are the designs in their order, last "none". ``matrix[k, j] = p(z = j | x = k)`` is the posterior
-mean of the score of feature j given class k (`posterior_mean_rows`). With c_j the corrected correlation of design j
-with the patch and ``visible`` the share of its cells in the image (docs/theory/recognition.md)::
+Classes and features are the designs in their order, last "none". With phi_k what speaks for design k in a frame
+(`sonar_graph.sonar.figures.EVIDENCE`) and w the weights, which all designs share::
 
-    s_j     ~  (1 - max(c_j, 0)^2)^(-sharpness visible)
-    s_none  ~  (1 - threshold^2)^(-sharpness visible)
+    l_k = w . phi_k        l_none = 0        log odds of a track that always looks like this
+
+The log odds of a track are the mean of l over its looks, times ``W / (W + looks)`` with W the number of independent
+looks: they are bounded, because what was not foreseen of a landmark repeats from look to look. ``matrix[k, j] =
+p(z = j | x = k)`` is the posterior mean of the score of feature j given class k (`posterior_mean_rows`), a score being
+the posterior of one look.
 
 The model that ships, ``default_confusion.json``, was measured on simulated basins with the designs that ship.
 `sonar_graph.recognition.confusion_fit` measures others.
@@ -27,31 +30,23 @@ from sonar_graph.errors import CalibrationError
 from sonar_graph.files import text_of
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.settings import faults_in
+from sonar_graph.sonar.figures import EVIDENCE
 
-BEST_CORRELATION = 0.999
-"""Upper limit of correlations, which keeps the scores finite."""
+SHIPPED = Path(__file__).with_name("default_confusion.json")
+"""The model of the designs that ship."""
 JEFFREYS = 0.5
 """Prior count of each feature."""
-STANDARD_ATTENUATION = 0.896
-"""Correlation of the shipped designs with their own patches that speckle leaves, in the window that ships: their mean.
-Correlations are corrected to it (`sonar_graph.sonar.appearance`)."""
-TRACK_SPREAD = 0.0135
-"""Standard deviation of the median corrected correlation of a landmark's track: 8 tracks of the shipped designs."""
-UNMEASURED_THRESHOLD = STANDARD_ATTENUATION - 3 * TRACK_SPREAD
-"""For designs that were never measured: fits worse than those of a landmark's tracks are of something else."""
 ASSUMED_RIGHT = 0.9
 """Share of frames in which an unmeasured landmark is assumed to show its own feature."""
 
 
-def soft_scores(correlation: Floats, visible: Floats, sharpness: float, threshold: float) -> Floats:
-    """Soft scores of the features: each design, last "none of the above", shape (n, designs + 1), rows sum to 1.
+def soft_scores(log_odds: Floats, looks: float) -> Floats:
+    """Soft scores of the features from single looks, shape (n, designs + 1), rows sum to 1.
 
-    From the correlation of each design with n patches, shape (n, designs), and the visible shares, shape (n,).
+    From the log odds of each design and none of them, shape (n, designs + 1), of a model with this number of looks.
     """
-    known = np.clip(correlation, 0.0, BEST_CORRELATION)
-    none = np.full((len(known), 1), threshold)
-    logits = -sharpness * visible[:, None] * np.log1p(-(np.hstack([known, none]) ** 2))
-    odds = np.exp(logits - logits.max(axis=1, keepdims=True))
+    share = log_odds / (1.0 + looks)
+    odds = np.exp(share - share.max(axis=1, keepdims=True))
     return np.asarray(odds / odds.sum(axis=1, keepdims=True))
 
 
@@ -72,14 +67,18 @@ class Confusion(Section):
     """The designs as measured; without them no recogniser accepts the model."""
     matrix: tuple[tuple[float, ...], ...]
     """p(z = j | x = k), shape (ids + 1, ids + 1); the last row and column are "none of them"."""
-    sharpness: float = Field(gt=0)
-    """Exponent of the scores; half the effective number of independent samples in a patch."""
-    threshold: float = Field(gt=0, lt=1)
-    """Corrected correlation at which "none of them" is as probable as a design."""
+    weights: tuple[float, ...]
+    """How much each column of `EVIDENCE` counts, in nats."""
+    looks: float = Field(gt=0)
+    """Number of independent looks that give a track half of the log odds of endless ones."""
+    doubt: float = Field(5e-4, ge=0, lt=1)
+    """Share of tracks whose looks tell nothing: what was never seen in n tracks may still happen in 1 / 2n of them."""
     range_sigma_m: float = Field(gt=0)
     """Standard deviation of the range in a frame that shows the whole landmark."""
     azimuth_sigma_rad: float = Field(gt=0)
     """The same of the azimuth."""
+    height_bias_m: float = Field(0.0, gt=-1, lt=1)
+    """Height of the faces that sound sees over the heights of the true landmarks."""
     error_correlation: float = Field(0.0, ge=0, lt=1)
     """Correlation of the errors of range and azimuth in successive frames of a track."""
     provenance: Mapping[str, str] = Field(default_factory=dict)
@@ -93,6 +92,8 @@ class Confusion(Section):
             raise ValueError(f"designs: expected one for each of {len(self.ids)} ids, not {len(self.designs)}")
         if matrix.shape != (classes, classes):
             raise ValueError(f"matrix: expected {classes} rows of {classes} for {len(self.ids)} ids and none of them")
+        if len(self.weights) != len(EVIDENCE):
+            raise ValueError(f"weights: expected {len(EVIDENCE)}, for {', '.join(EVIDENCE)}")
         if (matrix < 0).any() or not np.allclose(matrix.sum(axis=1), 1, atol=1e-6):
             raise ValueError("matrix: each row must be probabilities that sum to 1 (rows are the true classes)")
         if (matrix == 0).any():
@@ -125,6 +126,10 @@ class Confusion(Section):
         """The matrix, shape (ids + 1, ids + 1)."""
         return np.array(self.matrix)
 
+    def log_odds(self, evidence: Floats) -> Floats:
+        """Log odds of each design against none of them, shape (..., designs), from evidence (..., designs, 8)."""
+        return np.asarray(evidence @ np.array(self.weights))
+
     def range_azimuth_cov(self, visible: float) -> Floats:
         """Covariance of range and azimuth of a landmark with this share in view, shape (2, 2).
 
@@ -139,10 +144,6 @@ class Confusion(Section):
         as ``1 + (n - 1) (1 - rho) / (1 + rho)`` independent ones: one more in every ``(1 + rho) / (1 - rho)`` frames.
         """
         return math.ceil((1 + self.error_correlation) / (1 - self.error_correlation) - 1e-9)
-
-    def base(self) -> Floats:
-        """Share of each feature for equally frequent classes, shape (ids + 1,)."""
-        return np.asarray(self.array().mean(axis=0))
 
 
 def posterior_mean_rows(mean_scores: Floats, trials: Ints) -> Floats:
@@ -169,7 +170,13 @@ def read_confusion(path: Path) -> Confusion:
         When the file is not JSON or not such a model, naming the field.
     """
     try:
-        return Confusion.model_validate(json.loads(text_of(path)))
+        values = json.loads(text_of(path))
+        if isinstance(values, dict) and "sharpness" in values:
+            raise CalibrationError(
+                f"{path}: weights: missing; it has sharpness and threshold, which belong to an earlier version that "
+                "compared by correlation; measure it again with sonar-graph calibrate"
+            )
+        return Confusion.model_validate(values)
     except OSError as error:
         raise CalibrationError(f"{path} cannot be read: {error.strerror}") from error
     except ValidationError as error:
@@ -183,7 +190,7 @@ def read_confusion(path: Path) -> Confusion:
 def confusion_for(designs: Sequence[LandmarkDesign]) -> Confusion:
     """The model that ships for the designs that ship; for others an assumed one, which says so in its provenance."""
     ids = tuple(design.id for design in designs)
-    shipped = read_confusion(Path(__file__).with_name("default_confusion.json"))
+    shipped = read_confusion(SHIPPED)
     marks = tuple(map(mark_of, designs))
     if (ids, marks) == (shipped.ids, shipped.designs):
         return shipped
@@ -195,9 +202,8 @@ def confusion_for(designs: Sequence[LandmarkDesign]) -> Confusion:
             "ids": ids,
             "designs": marks,
             "matrix": tuple(map(tuple, matrix.tolist())),
-            "threshold": UNMEASURED_THRESHOLD,
             "provenance": {
-                "origin": f"assumed: {ASSUMED_RIGHT:.0%} right, threshold derived from the contrast of the designs; "
+                "origin": f"assumed: {ASSUMED_RIGHT:.0%} right, weights of the evidence those of the shipped designs; "
                 "measure it with sonar-graph calibrate"
             },
         }

@@ -29,8 +29,8 @@ from sonar_graph.measurements import Floats
 class FloorView:
     """A sonar over a level floor.
 
-    Level axes have their origin at the sonar, z up and x horizontal, along the centre beam; the floor is the plane
-    ``z = -height_m``.
+    Level axes have their origin at the sonar, z up and x horizontal, along the centre beam or where `turned` says; the
+    floor is the plane ``z = -height_m``.
 
     Raises
     ------
@@ -65,6 +65,11 @@ class FloorView:
         forward = rotation.matrix()[:, 0]
         heading = gtsam.Rot3.Rz(math.atan2(forward[1], forward[0]))
         return cls((heading.inverse() * rotation).matrix(), float(world_T_sonar.translation()[2]) - floor_z_m)
+
+    def turned(self, bearing_rad: float) -> FloorView:
+        """The same view with level axes whose x axis points to this bearing."""
+        level_R_ahead = gtsam.Rot3.Rz(bearing_rad).matrix()
+        return replace(self, level_R_sonar=level_R_ahead.T @ self.level_R_sonar)
 
     def floor_points(self, ranges_m: Floats, azimuths_rad: Floats) -> Floats:
         """Points in the sonar frame where rays meet the floor, shape (n, 3); NaN where they do not."""

@@ -126,6 +126,8 @@ class Recogniser:
         """Fit of the designs to each track of the last frame; None for a track without a candidate."""
         self.track_ids: Ints = np.empty(0, dtype=np.int64)
         """Numbers of these tracks."""
+        self.news: Floats = np.empty(0)
+        """Independent share of the last frame for these tracks."""
 
     def process(
         self, frame: SonarFrames, motion: SonarStep | None = None, view: FloorView | None = None
@@ -154,7 +156,7 @@ class Recogniser:
         """
         check_block(frame)
         self.stamp_ns = stamp_ns = int(frame.stamps_ns[0])
-        self.sightings, self.track_ids = [], np.empty(0, dtype=np.int64)
+        self.sightings, self.track_ids, self.news = [], np.empty(0, dtype=np.int64), np.empty(0)
         if motion is not None:
             self._start_T_sonar = self._start_T_sonar.compose(motion.previous_T_sonar)
         if (fault := self._check.fault(frame)) is not None:
@@ -166,13 +168,14 @@ class Recogniser:
         association = self._tracker.step(candidates, motion, stamp_ns)
         self.track_ids = association.ids
         self.sightings = self._look.at(image_db, frame, view, candidates, association.candidate)
-        scores = self._look.scores(self.sightings)
+        log_odds = self._look.log_odds(self.sightings)
         place = self._start_T_sonar.translation()
         places = [None if sighting is None or sighting.fit is None else place for sighting in self.sightings]
         azimuth = np.arctan2(association.position_m[:, 1], association.position_m[:, 0])
         across = np.column_stack([-np.sin(azimuth), np.cos(azimuth), np.zeros_like(azimuth)])
         sideways = np.asarray(across @ self._start_T_sonar.rotation().matrix().T)
-        beliefs = self._beliefs.step(association, scores, places, sideways)
+        beliefs = self._beliefs.step(association, log_odds, places, sideways)
+        self.news = self._beliefs.weights
         found = self._report(candidates, association, beliefs)
         if self._check.change is not None:
             self.fates.append(Fate(stamp_ns, -1, np.nan, np.nan, self._check.change))

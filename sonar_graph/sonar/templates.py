@@ -22,8 +22,10 @@ from sonar_graph.sonar.geometry import FloorView
 
 Floats32 = NDArray[np.float32]
 HEADINGS = 48
-FINE = 5
+FINE = 4
 """Points of a cell, along each axis, over which a mask is averaged."""
+SEARCHED_DARK = 0.5
+"""Share of the dark parts' level in the templates of the search: a plate may be as its design or not be seen."""
 SAME_SHARE = 0.05
 """Largest squared difference of headings that share a template, as a share of their variance."""
 
@@ -39,7 +41,7 @@ class Templates:
     cells: Ints
     """Which points of the square, row by row, are compared, shape (cells,)."""
     pictures: Floats32
-    """Decibels over the floor, shape (templates, cells)."""
+    """Decibels over the floor, of dark parts `SEARCHED_DARK` of them, shape (templates, cells)."""
     design: Ints
     """Which of the designs each is of, shape (templates,)."""
     heading_rad: Floats
@@ -61,17 +63,13 @@ class Templates:
         away_m = np.hypot(x_m, y_m)
         is_behind = (away_m > material_m) & (x_m > 0.5 * away_m)
         cells = np.flatnonzero((away_m <= material_m + margin_m) & ~is_behind)
-        fine_m = cell_m / FINE * (np.arange(side * FINE) - side * FINE / 2 + 0.5)
-        fine_x_m, fine_y_m = np.meshgrid(fine_m, fine_m, indexing="ij")
         pictures: list[Floats32] = []
         of: list[int] = []
         headings: list[float] = []
         for index, design in enumerate(designs):
             for heading in 2 * np.pi * np.arange(HEADINGS) / HEADINGS:
-                cos, sin = math.cos(heading), math.sin(heading)
-                level = design.level_db(cos * fine_x_m + sin * fine_y_m, -sin * fine_x_m + cos * fine_y_m)
-                blurred = cv2.GaussianBlur(np.nan_to_num(level).astype(np.float32), (0, 0), blur_m / cell_m * FINE)
-                picture = blurred.reshape(side, FINE, side, FINE).mean(axis=(1, 3)).ravel()[cells]
+                bright, dark = drawn(design, heading, side, cell_m, blur_m)
+                picture = (bright + SEARCHED_DARK * dark).ravel()[cells]
                 same = (
                     np.mean((picture - known) ** 2) < SAME_SHARE * known.var()
                     for known, i in zip(pictures, of, strict=True)
@@ -82,6 +80,26 @@ class Templates:
                     of.append(index)
                     headings.append(heading)
         return cls(cell_m, side, cells, np.array(pictures, np.float32), np.array(of), np.array(headings))
+
+
+def drawn(
+    design: LandmarkDesign, heading_rad: float, side: int, cell_m: float, blur_m: float,
+    stretch: tuple[float, float] = (1.0, 1.0),
+) -> tuple[Floats32, Floats32]:  # fmt: skip
+    """Bright and dark parts of a design over the floor, dB, as the sonar sees them, shapes (side, side).
+
+    Stretched along its axes x and y, and blurred by the resolution of the sonar.
+    """
+    fine_m = cell_m / FINE * (np.arange(side * FINE) - side * FINE / 2 + 0.5)
+    x_m, y_m = np.meshgrid(fine_m, fine_m, indexing="ij")
+    cos, sin = math.cos(heading_rad), math.sin(heading_rad)
+    level = design.level_db((cos * x_m + sin * y_m) / stretch[0], (-sin * x_m + cos * y_m) / stretch[1])
+    level = np.nan_to_num(level).astype(np.float32)
+    bright, dark = (
+        cv2.GaussianBlur(part, (0, 0), blur_m / cell_m * FINE).reshape(side, FINE, side, FINE).mean(axis=(1, 3))
+        for part in (np.maximum(level, 0), np.minimum(level, 0))
+    )
+    return bright, dark
 
 
 def material_radius_m(design: LandmarkDesign) -> float:
@@ -104,8 +122,19 @@ class Patch:
     """Mean level on the grid, shape (side, side), first axis x, second y; 0 where not seen."""
     seen: Floats32
     """1 where the image holds the point, else 0, shape (side, side)."""
+    smooth_db: Floats32
+    """Means of the levels seen in 3 by 3 cells, shape (side, side)."""
+    held: Floats32
+    """Share of these cells that is seen, shape (side, side)."""
     centre_m: Floats
     """(x, y) of its middle on the floor, shape (2,)."""
+
+    @classmethod
+    def of(cls, level_db: Floats32, seen: Floats32, centre_m: Floats) -> Patch:
+        """Patch with these levels."""
+        held = np.asarray(cv2.blur(seen, (3, 3)), np.float32)
+        smooth = np.asarray(cv2.blur(level_db, (3, 3)) / np.maximum(held, np.float32(0.1)), np.float32)
+        return cls(level_db, seen, smooth, held, centre_m)
 
 
 class PolarGrid(NamedTuple):
@@ -138,7 +167,7 @@ class PolarGrid(NamedTuple):
         """The image on a grid of ``side`` by ``side`` floor points around a centre."""
         level, seen = np.zeros((2, side, side), np.float32)
         sample_floor(self, image_db, view.level_R_sonar, view.height_m, centre_m, cell_m, level, seen)
-        return Patch(level, seen, centre_m)
+        return Patch.of(level, seen, centre_m)
 
 
 @compiled

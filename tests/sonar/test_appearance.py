@@ -11,15 +11,9 @@ from scipy.special import erf
 from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.images import SonarFrames
 from sonar_graph.measurements import Floats
-from sonar_graph.sonar.appearance import (
-    CENTROID_SIGMA_M,
-    Appearance,
-    CandidateFit,
-    DesignFit,
-    ObjectSighting,
-    noise_db2,
-)
-from sonar_graph.sonar.confusion import STANDARD_ATTENUATION, Confusion, confusion_for, soft_scores
+from sonar_graph.sonar.appearance import CENTROID_SIGMA_M, Appearance, CandidateFit, DesignFit, ObjectSighting
+from sonar_graph.sonar.confusion import Confusion, confusion_for
+from sonar_graph.sonar.figures import EVIDENCE
 from sonar_graph.sonar.geometry import FloorView
 from sonar_graph.sonar.templates import Patch, PolarGrid, Templates, material_radius_m
 
@@ -43,7 +37,9 @@ def appearance() -> Appearance:
     return Appearance(DEFAULT_DESIGNS)
 
 
-def _fit(appearance: Appearance, image: Floats, near_m: tuple[float, float], view: FloorView = VIEW) -> DesignFit:
+def _fit(
+    appearance: Appearance, image: Floats, near_m: tuple[float, float], view: FloorView = VIEW
+) -> DesignFit | None:
     return appearance.fit(GRID.patch(image, view, np.array(near_m), appearance.patch_side, appearance.params.cell_m))
 
 
@@ -169,61 +165,66 @@ def test_every_design_is_known_at_every_heading_in_speckle(appearance, index, he
     rotation = level_R_sonar(np.radians(31), np.radians(-2))
     image = image_db(DEFAULT_DESIGNS[index], (1.7, 0.05), heading_rad, rotation, np.random.default_rng(index))
     fit = _fit(appearance, image, (1.72, 0.03), FloorView(rotation, HEIGHT_M))
-    assert fit.best == index
-    assert fit.correlation[index] > 0.75
-    assert fit.correlation[index] - np.delete(fit.correlation, index).max() > 0.02
-    np.testing.assert_allclose(fit.centre_m, [1.7, 0.05], atol=0.008)
+    found = odds(fit)
+    assert found[index] > 5
+    assert np.delete(found, index).max() < found[index] - 10
+    np.testing.assert_allclose(fit.centre_m[index], [1.7, 0.05], atol=0.008)
 
 
-@pytest.mark.parametrize("rim", [39, 36, 27, 22])
-def test_the_best_fit_is_that_of_numpy_over_the_cells_in_view(appearance, rim: int):
-    """All shifts and headings by `np.corrcoef`, on noise of which the image holds the first columns, with holes."""
+@pytest.mark.parametrize("rim", [47, 44, 35, 30])
+def test_places_and_headings_are_those_of_the_best_correlation_over_the_cells_in_view(appearance, rim: int):
+    """A landmark in noise, of which the image holds the first columns; all shifts and headings by `np.corrcoef`."""
     templates, side, rng = appearance.templates, appearance.patch_side, np.random.default_rng(rim)
-    seen = ((np.arange(side) < rim) & (rng.random((side, side)) < (0.99 if rim == 39 else 1.0))).astype(np.float32)
-    level = rng.normal(40, 5, (side, side)).astype(np.float32) * seen
     x, y = np.divmod(templates.cells, templates.side)
-    steps = range(side - templates.side + 1)
-    best: dict[int, tuple[float, float, int]] = {}
+    steps, row = range(2 * appearance._steps + 1), len(templates.design) // 2
+    level = rng.normal(40, 4, (side, side)).astype(np.float32)
+    level[x + appearance._rim + 4, y + appearance._rim + 2] += templates.pictures[row]
+    seen = np.tile(np.arange(side) < rim, (side, 1)).astype(np.float32)
+    fit = appearance.fit(Patch.of(level * seen, seen, np.zeros(2)))
+    best = (-1.0, 0, 0, 0, 0.0)
     for i, j in ((i, j) for i in steps for j in steps):
-        held = seen[x + i, y + j] > 0
+        held = seen[x + appearance._rim + i, y + appearance._rim + j] > 0
         if held.mean() >= appearance.params.least_searched:
-            window = level[x + i, y + j][held]
-            for picture, design in zip(templates.pictures, templates.design.tolist(), strict=True):
-                found = float(np.corrcoef(window, picture[held])[0, 1]), float(held.mean()), design
-                best[design] = max(best.get(design, found), found)
-    highest = max(best.values())
-    fit = appearance.fit(Patch(level, seen, np.zeros(2)))
-    assert fit.best == highest[2]
-    assert fit.visible == pytest.approx(highest[1], abs=1e-6)
-    wanted = [best[design][0] for design in range(appearance.designs)] if highest[1] >= 0.8 else [-1.0] * 4
-    assert fit.correlation == pytest.approx(wanted, abs=1e-5)
+            window = level[x + appearance._rim + i, y + appearance._rim + j][held]
+            for n, picture in enumerate(templates.pictures):
+                best = max(best, (float(np.corrcoef(window, picture[held])[0, 1]), n, i, j, float(held.mean())))
+    _, template, i, j, visible = best
+    if visible < appearance.params.least_visible:
+        assert fit is None
+        return
+    design = templates.design[template]
+    assert template == row
+    assert fit.heading_rad[design] == templates.heading_rad[template]
+    np.testing.assert_allclose(fit.centre_m[design], 0.015 * (np.array([i, j]) - appearance._steps), atol=0.0075)
+    assert fit.visible == pytest.approx(visible, abs=0.12)
 
 
-def test_gain_and_floor_level_cost_nothing_and_a_wrong_height_does(appearance):
-    """The heading of a triangle is found up to its symmetry."""
+def odds(fit: DesignFit, model: Confusion | None = None) -> np.ndarray:
+    return (model or MODEL).log_odds(fit.evidence)
+
+
+def test_gain_and_floor_level_change_nothing(appearance):
+    """Decibels are as the sonar's gain lifts them; the heading of a triangle is found up to its symmetry."""
     image = image_db(DEFAULT_DESIGNS[2], (1.7, 0.0), 0.4, ROTATION, np.random.default_rng(0))
-    plain, other = (_fit(appearance, picture, (1.7, 0.0)) for picture in (image, 0.5 * image + 20))
-    np.testing.assert_allclose(other.correlation, plain.correlation, atol=1e-3)
-    off = (plain.heading_rad - 0.4) % (2 * np.pi / 3)
+    plain, other = (_fit(appearance, picture, (1.7, 0.0)) for picture in (image, image + 20))
+    np.testing.assert_allclose(other.evidence, plain.evidence, atol=2e-3)
+    off = (plain.heading_rad[2] - 0.4) % (2 * np.pi / 3)
     assert min(off, 2 * np.pi / 3 - off) < np.radians(5)
-    low = _fit(appearance, image, (1.9, 0.0), FloorView(ROTATION, 0.5))
-    assert low.correlation[2] < plain.correlation[2] - 0.05
-
-
-def test_bare_floor_and_a_bar_fit_no_design_well(appearance):
-    rng, bar = np.random.default_rng(3), np.full((60, 60), np.nan)
-    bar[24:36] = 12.0
-    for design in (None, LandmarkDesign(9, "bar", 0.42, bar)):
-        fit = _fit(appearance, image_db(design, (1.7, 0.0), 0.2, ROTATION, rng), (1.7, 0.0))
-        assert fit.correlation.max() < 0.7
 
 
 @pytest.mark.parametrize("design", DEFAULT_DESIGNS, ids=lambda design: design.name)
-def test_the_rim_of_the_image_does_not_push_a_landmark_aside(appearance, design):
-    for y_m in np.linspace(0.34, 0.46, 7):
-        fit = _fit(appearance, image_db(design, (1.7, y_m), 0.6), (1.7, y_m - 0.02))
-        if fit.correlation.max() > 0:
-            np.testing.assert_allclose(fit.centre_m, (1.7, y_m), atol=0.003)
+def test_weaker_contrast_lowers_the_odds_and_not_the_ranking(appearance, design):
+    strong, weak = (
+        odds(_fit(appearance, image_db(weaker(design, by_db), (1.7, 0.0), 0.3, ROTATION, rng), (1.7, 0.0)))
+        for by_db, rng in zip((3.0, 9.0), map(np.random.default_rng, (1, 1)), strict=True)
+    )
+    assert strong.argmax() == weak.argmax() == design.id - 1
+    assert strong.max() > weak.max() > 0
+
+
+def weaker(design: LandmarkDesign, by_db: float) -> LandmarkDesign:
+    """Its foam that much less bright."""
+    return replace(design, mask=np.where(design.mask > 0, design.mask - by_db, design.mask))
 
 
 def on_floor(design: LandmarkDesign) -> LandmarkDesign:
@@ -231,35 +232,62 @@ def on_floor(design: LandmarkDesign) -> LandmarkDesign:
     return replace(design, mask=np.where(design.mask > 0, design.mask, np.nan))
 
 
-@pytest.mark.parametrize("bin_m", [0.0024, 0.02])
-@pytest.mark.parametrize("designs", [DEFAULT_DESIGNS, tuple(map(on_floor, DEFAULT_DESIGNS))], ids=["plates", "bare"])
-def test_speckle_lowers_the_correlation_of_a_design_by_its_attenuation(designs, bin_m: float):
-    """A template in white noise, as strong as speckle in such bins."""
-    appearance, rng = Appearance(designs), np.random.default_rng(0)
-    templates, side = appearance.templates, appearance.patch_side
-    sigma_db, found = np.sqrt(noise_db2(appearance.params.cell_m, bin_m)), np.zeros((6, len(designs)))
-    for k in range(len(designs)):
-        picture = templates.pictures[templates.design == k][0]
-        for draw in found:
-            level = rng.normal(40.0, sigma_db, (side, side))
-            x, y = np.divmod(templates.cells, templates.side)
-            level[x + appearance._steps, y + appearance._steps] += picture
-            draw[k] = appearance.fit(
-                Patch(level.astype(np.float32), np.ones((side, side), np.float32), np.zeros(2))
-            ).correlation[k]
-    np.testing.assert_allclose(found.mean(axis=0), appearance.attenuation(bin_m), atol=0.02)
+@pytest.mark.parametrize("design", DEFAULT_DESIGNS, ids=lambda design: design.name)
+def test_a_plate_that_is_not_seen_is_no_evidence_against_a_design(appearance, design):
+    seen, unseen = (
+        _fit(appearance, image_db(one, (1.7, 0.0), 0.3, ROTATION, np.random.default_rng(2)), (1.7, 0.0))
+        for one in (design, on_floor(design))
+    )
+    plate = EVIDENCE.index("plate")
+    assert unseen.evidence[design.id - 1, plate] < 0.5 * seen.evidence[design.id - 1, plate]
+    assert odds(unseen).argmax() == design.id - 1
+    assert odds(unseen).max() > 0
 
 
-def test_a_window_of_long_bins_and_a_design_of_low_contrast_attenuate_more():
-    bare, plates = Appearance(tuple(map(on_floor, DEFAULT_DESIGNS))), Appearance(DEFAULT_DESIGNS)
-    assert plates.attenuation(0.00244).mean() == pytest.approx(STANDARD_ATTENUATION, abs=1e-3)
-    assert (bare.attenuation(0.00244) < plates.attenuation(0.00244) - 0.05).all()
-    assert (plates.attenuation(0.0137) < plates.attenuation(0.00244) - 0.05).all()
-    assert (plates.attenuation(0.0137) == plates.attenuation(0.02)).all(), "both show one look a cell"
+def drawn(figure: Floats, below_db: float | None = None) -> LandmarkDesign:
+    """A figure of 12 dB, and where it is not a level or the floor."""
+    return LandmarkDesign(9, "figure", 0.6, np.where(figure, 12.0, np.nan if below_db is None else below_db))
+
+
+def strangers() -> dict[str, LandmarkDesign | None]:
+    x, y = np.meshgrid(0.002 * (np.arange(300) - 149.5), 0.002 * (149.5 - np.arange(300)))
+    bar, small = (np.abs(y) < 0.04) & (np.abs(x) < 0.25), np.hypot(x, y) < 0.09
+    ragged = np.hypot(x, y) < 0.13 + 0.05 * np.cos(3 * np.arctan2(y, x)) + 0.03 * np.cos(5 * np.arctan2(y, x) + 1)
+    return {
+        "floor": None, "bar": drawn(bar), "a lid of another size": drawn(small), "ragged": drawn(ragged),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("name", strangers())
+def test_a_stranger_is_none(appearance, name):
+    image = image_db(strangers()[name], (1.7, 0.0), 0.2, ROTATION, np.random.default_rng(3))
+    assert odds(_fit(appearance, image, (1.7, 0.0))).max() < -2
+
+
+def test_a_long_shadow_speaks_against_a_design(appearance):
+    """A square with the floor dark behind it as far as something 5 cm high would shade it, or not."""
+    square = on_floor(DEFAULT_DESIGNS[1])
+    image = image_db(square, (1.7, 0.0), 0.0, ROTATION, np.random.default_rng(4))
+    shaded = image.copy()
+    r, a = np.meshgrid(RANGES_M, AZIMUTHS_RAD)
+    x = np.sqrt(np.maximum((r * np.cos(a)) ** 2 + 0 * a, 0))
+    first, last = (VIEW.range_azimuth(np.array([1.7 + d, 0.0]))[0] for d in (0.15, 0.24))
+    dark = (r > first) & (r < last) & (np.abs(r * np.sin(a)) < 0.13) & (x > 0)
+    shaded[dark] -= 15
+    plain, behind = (odds(_fit(appearance, one, (1.7, 0.0)))[1] for one in (image, shaded))
+    assert behind < plain - 1
+
+
+@pytest.mark.parametrize("design", DEFAULT_DESIGNS, ids=lambda design: design.name)
+def test_the_rim_of_the_image_does_not_push_a_landmark_aside(appearance, design):
+    for y_m in np.linspace(0.34, 0.46, 7):
+        fit = _fit(appearance, image_db(design, (1.7, y_m), 0.6), (1.7, y_m - 0.02))
+        if fit is not None:
+            np.testing.assert_allclose(fit.centre_m[design.id - 1], (1.7, y_m), atol=0.004)
 
 
 APERTURE_RAD = 0.244
-SETTINGS = {"threshold": 0.7, "range_sigma_m": 0.01, "azimuth_sigma_rad": 0.004}
+SETTINGS = {"height_bias_m": 0.0, "range_sigma_m": 0.01, "azimuth_sigma_rad": 0.004}
 MODEL = confusion_for(DEFAULT_DESIGNS).model_copy(update=SETTINGS)
 TRIANGLE = 2
 
@@ -290,28 +318,19 @@ def triangle() -> np.ndarray:
 def test_range_and_azimuth_are_those_of_the_centre_and_less_certain_where_partly_in_view(appearance, triangle):
     found = look_at(appearance, triangle, (1.725, 0.03))
     r, a = VIEW.range_azimuth(np.array([1.7, 0.05]))
-    assert (found.is_fitted, found.fit.best) == (True, TRIANGLE)
+    assert odds(found.fit).argmax() == TRIANGLE
     assert (found.range_m, found.azimuth_rad) == (pytest.approx(r, abs=0.006), pytest.approx(a, abs=0.004))
     np.testing.assert_allclose(found.covariance, np.diag([0.01**2, 0.004**2]) / found.fit.visible**4)
     found = look_at(appearance, image_db(DEFAULT_DESIGNS[0], (1.7, 0.34), 0.0), (1.7, 0.33))
-    assert found.is_fitted
     assert 0.8 <= found.fit.visible < 0.97
     np.testing.assert_allclose(found.covariance, np.diag([0.01**2, 0.004**2]) / found.fit.visible**4)
 
 
-def test_correlations_of_a_sighting_are_corrected_for_speckle(appearance, triangle):
-    found = look_at(appearance, triangle, (1.7, 0.05))
-    centre = np.array(VIEW.floor_point(*VIEW.range_azimuth(np.array([1.7, 0.05]))))
-    raw = _fit(appearance, triangle, tuple(centre)).correlation
-    expected = raw * STANDARD_ATTENUATION / appearance.attenuation(RANGES_M[1] - RANGES_M[0])
-    np.testing.assert_allclose(found.fit.correlation, expected, rtol=1e-3)
-
-
-def test_what_no_design_fits_stays_where_its_centroid_is(appearance, triangle):
-    found = look_at(appearance, triangle, (1.725, 0.03), MODEL.model_copy(update={"threshold": 0.999}))
-    r, a = VIEW.range_azimuth(np.array([1.725, 0.03]))
-    assert (found.is_fitted, found.fit.best, found.range_m, found.azimuth_rad) == (False, TRIANGLE, r, a)
-    np.testing.assert_allclose(found.covariance, np.diag([CENTROID_SIGMA_M**2, (CENTROID_SIGMA_M / r) ** 2]))
+def test_a_face_that_is_higher_than_the_landmarks_place_seems_nearer_by_what_is_added(appearance, triangle):
+    high = MODEL.model_copy(update={"height_bias_m": 0.02})
+    plain, found = (look_at(appearance, triangle, (1.7, 0.05), model) for model in (MODEL, high))
+    assert found.range_m - plain.range_m == pytest.approx(0.02 * HEIGHT_M / plain.range_m, rel=1e-6)
+    assert look_at(appearance, triangle, (1.7, 0.05), high, view=None).range_per_height == 0.0
 
 
 @pytest.mark.parametrize(
@@ -325,28 +344,29 @@ def test_what_no_design_fits_stays_where_its_centroid_is(appearance, triangle):
 def test_what_is_not_in_view_is_compared_with_nothing(appearance, triangle, near_m, view, aperture_rad):
     found = look_at(appearance, triangle, near_m, view=view, aperture_rad=aperture_rad)
     assert found.fit is None
-    assert (found.range_m, found.azimuth_rad, found.is_fitted) == (*VIEW.range_azimuth(np.array(near_m)), False)
+    r, a = VIEW.range_azimuth(np.array(near_m))
+    assert (found.range_m, found.azimuth_rad) == (r, a)
+    np.testing.assert_allclose(found.covariance, np.diag([CENTROID_SIGMA_M**2, (CENTROID_SIGMA_M / r) ** 2]))
 
 
-def test_rows_say_which_candidate_and_scores_are_those_of_the_model(appearance, triangle):
+def test_rows_say_which_candidate_and_odds_are_those_of_the_model(appearance, triangle):
     r, a = VIEW.range_azimuth(np.array([1.7, 0.05]))
     look = CandidateFit(appearance, MODEL, APERTURE_RAD)
     candidates = candidates_at([2.05, r], [-0.1, a])
     none, seen, beside = look.at(triangle, frame(triangle), VIEW, candidates, np.array([-1, 1, 0]))
     assert none is None
-    assert seen.is_fitted
     assert beside.azimuth_rad == pytest.approx(-0.1, abs=0.05)
-    scores, fit = look.scores([none, seen, beside]), seen.fit
-    expected = soft_scores(fit.correlation[None], np.array([fit.visible]), MODEL.sharpness, MODEL.threshold)[0]
-    np.testing.assert_allclose(scores[:2], [np.zeros(5), expected])
-    assert scores[1].argmax() == TRIANGLE
+    found = look.log_odds([none, seen, beside])
+    assert np.isnan(found[0]).all()
+    np.testing.assert_allclose(found[1], [*MODEL.log_odds(seen.fit.evidence), 0.0])
+    assert found[1].argmax() == TRIANGLE
 
 
 def test_other_beams_and_bins_are_looked_up_anew(appearance, triangle):
     """A log may change its window on the way: beams the other way round, fewer bins, farther bins."""
     look, (r, a) = CandidateFit(appearance, MODEL, APERTURE_RAD), VIEW.range_azimuth(np.array([1.7, 0.05]))
     first, turned, fewer, farther = (
-        look.at(image, frame(image, *window), VIEW, candidates_at([r], [a]), np.array([0]))[0].fit.correlation
+        look.at(image, frame(image, *window), VIEW, candidates_at([r], [a]), np.array([0]))[0].fit.evidence
         for image, *window in (
             (triangle, RANGES_M, AZIMUTHS_RAD),
             (np.ascontiguousarray(triangle[::-1]), RANGES_M, AZIMUTHS_RAD[::-1].copy()),
@@ -354,7 +374,7 @@ def test_other_beams_and_bins_are_looked_up_anew(appearance, triangle):
             (triangle, RANGES_M + 0.1, AZIMUTHS_RAD),
         )
     )
-    np.testing.assert_allclose([turned, fewer], [first, first], atol=1e-3)
+    np.testing.assert_allclose([turned, fewer], [first, first], atol=5e-3)
     assert abs(farther - first).max() > 0.05
 
 
@@ -366,6 +386,6 @@ def test_without_a_floor_the_patch_lies_in_the_plane_of_the_image(appearance):
     r, a = np.hypot(1.9, 0.1), np.arctan2(0.1, 1.9)
     candidate, look = candidates_at([r], [a]), CandidateFit(appearance, MODEL, APERTURE_RAD)
     flat, tilted = (look.at(image, frame(image), view, candidate, np.array([0]))[0] for view in (None, VIEW))
-    assert flat.fit.best == 1
+    assert odds(flat.fit).argmax() == 1
     assert (flat.range_m, flat.azimuth_rad) == (pytest.approx(r, abs=0.006), pytest.approx(a, abs=0.003))
-    assert tilted.fit is None or tilted.fit.correlation[1] < flat.fit.correlation[1] - 0.02
+    assert tilted.fit is None or odds(tilted.fit)[1] < odds(flat.fit)[1] - 1

@@ -27,21 +27,17 @@ ROWS = ((0.8, 0.1, 0.1), (0.2, 0.7, 0.1), (0.5, 0.1, 0.4))
 
 def model(rows: tuple[tuple[float, ...], ...] = ROWS, designs: Sequence[LandmarkDesign] = ()) -> Confusion:
     return Confusion(
-        ids=tuple(range(9, 8 + len(rows))), matrix=rows, designs=tuple(map(mark_of, designs)), sharpness=9.0,
-        threshold=0.8, range_sigma_m=0.01, azimuth_sigma_rad=0.002,
+        ids=tuple(range(9, 8 + len(rows))), matrix=rows, designs=tuple(map(mark_of, designs)), weights=tuple(range(8)),
+        looks=2.0, range_sigma_m=0.01, azimuth_sigma_rad=0.002,
     )  # fmt: skip
 
 
-def test_odds_of_scores_are_those_of_the_equation():
-    scores = soft_scores(np.array([[0.9, 0.6, -0.4]]), np.array([0.5]), 10.0, 0.7)[0]
-    weight = (1 - np.array([0.9, 0.6, 0.0, 0.7]) ** 2) ** (-10.0 * 0.5)
-    np.testing.assert_allclose(scores, weight / weight.sum())
-    assert np.isfinite(soft_scores(np.array([[1.0, 1.0]]), np.ones(1), 500.0, 0.8)).all()
-
-
-def test_the_base_is_the_mean_of_the_matrix():
-    np.testing.assert_allclose(model().array(), ROWS)
-    np.testing.assert_allclose(model().base(), [0.5, 0.3, 0.2])
+def test_log_odds_are_weighted_evidence_and_scores_the_posterior_of_one_look():
+    evidence = np.eye(8)[[2, 5]]
+    np.testing.assert_allclose(model().log_odds(evidence), [2, 5])
+    scores = soft_scores(np.array([[3.0, -6.0, 0.0]]), 2.0)[0]
+    np.testing.assert_allclose(scores, np.exp([1, -2, 0]) / np.exp([1, -2, 0]).sum())
+    assert np.isfinite(soft_scores(np.array([[1e4, -1e4, 0.0]]), 1.0)).all()
 
 
 def test_rows_are_the_means_of_their_dirichlet_posteriors():
@@ -68,7 +64,9 @@ def test_what_was_never_confused_in_the_shipped_model_is_bounded_by_its_tracks()
         ({"matrix": [[0.8, 0.2], *ROWS[1:]]}, "matrix: expected 3 rows of 3 for 2 ids"),
         ({"matrix": [[0.9, 0.1, 0.0], *ROWS[1:]]}, "an entry is 0"),
         ({"designs": [{"name": "ring", "digest": ""}]}, "expected one for each of 2 ids, not 1"),
-        ({"sharpness": -1.0}, "sharpness"),
+        ({"looks": -1.0}, "looks"),
+        ({"weights": [1.0, 2.0]}, "weights: expected 8, for prior, outline"),
+        ({"sharpness": 17.0, "threshold": 0.8}, "an earlier version .* measure it again"),
         (None, "not JSON"),
     ],
 )
@@ -101,7 +99,7 @@ def test_designs_that_ship_have_a_measured_model_and_others_an_assumed_one():
     other = confusion_for([RING])
     assert other.ids == (9,)
     assert "assumed" in other.provenance["origin"]
-    assert other.threshold == pytest.approx(0.856, abs=5e-4)
+    assert other.weights == confusion_for(DEFAULT_DESIGNS).weights
     np.testing.assert_allclose(other.array().sum(axis=1), 1)
     other.check_designs([RING])
 
