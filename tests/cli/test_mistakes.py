@@ -128,7 +128,7 @@ MISTAKES = {
     "calibrate bare.mcap -o new.json": r"bare\.mcap: has no sonar images",
     "calibrate lane.mcap lane.mcap -o new.json": r"lane\.mcap: is named twice.*name each log once",
     "calibrate lane.mcap -o new.json --designs strange.toml": "true landmarks are 1, 2, 3, 4, the designs are 9: ",
-    "calibrate lane.mcap -o new.json --set identity.unknown_pror=1": r"the recogniser: identity\.unknown_pror: .*unknown_prior",
+    "calibrate lane.mcap -o new.json --set identity.unknown_pror=1": r"identity\.unknown_pror: .*unknown_prior",
 }
 
 
