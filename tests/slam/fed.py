@@ -24,6 +24,8 @@ class Fed:
     def __init__(self, lag_s: float, stale_shift_m: float = NEVER_M, *, is_bounded: bool = False) -> None:
         self.smoother = smoother_with(lag_s, 1e-6, stale_shift_m, is_bounded=is_bounded)
         self.groups: dict[int, Factors] = {}
+        self.live: list[gtsam.Pose3] = []
+        """Newest pose of the basin's run after each update."""
 
     def add(self, new: Factors) -> None:
         self.groups[self.smoother.add(new)] = new
@@ -95,12 +97,24 @@ def assert_is_least_squares(fed: Fed, numbers: Rail, nodes: int, landmarks: tupl
 
 
 def in_the_basin(
-    steps: int, lag_s: float, stale_shift_m: float = NEVER_M, seed: int = 0, bias_steps: int = 1000, kernel=plain
+    steps: int,
+    lag_s: float,
+    stale_shift_m: float = NEVER_M,
+    seed: int = 0,
+    bias_steps: int = 1000,
+    kernel=plain,
+    *,
+    height_m: float = -1.0,
+    sonar: gtsam.Pose3 = SONAR,
 ) -> Fed:
-    """Circles past three landmarks with a gyro bias that walks between stretches; nothing about it is linear."""
+    """Circles past three landmarks with a gyro bias that walks between stretches; nothing about it is linear.
+
+    The landmarks lie about a height that the smoother is not told.
+    """
     rng = np.random.default_rng(seed)
     turn = gtsam.Pose3(gtsam.Rot3.Rz(0.25), np.array([0.5, 0.0, 0.0]))
-    landmarks = {3: np.array([3.0, 1.0, -1.0]), 5: np.array([2.0, 4.0, -0.8]), 8: np.array([-1.0, 2.5, -1.2])}
+    landmarks = {3: np.array([3.0, 1.0, 0.0]), 5: np.array([2.0, 4.0, 0.2]), 8: np.array([-1.0, 2.5, -0.2])}
+    landmarks = {i: p + height_m * np.eye(3)[2] for i, p in landmarks.items()}
     cov = np.diag([1e-4] * 3 + [4e-4] * 3)
     fed, truth, seen = Fed(lag_s, stale_shift_m), gtsam.Pose3(), set()
     fed.smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
@@ -119,13 +133,14 @@ def in_the_basin(
             fed.smoother.add_bias(B(new), fed.smoother.values.atVector(B(new - 1)))
             fed.add({"bias walk": factors.bias_walk(B(new - 1), B(new), np.full(11, 0.003))})
         for i, p in landmarks.items():
-            z = polar(truth.compose(SONAR), p) + [0.02, 0.009] * rng.standard_normal(2)
+            z = polar(truth.compose(sonar), p) + [0.02, 0.009] * rng.standard_normal(2)
             if i not in seen:
                 fed.smoother.add_landmark(L(i), p + 0.3 * rng.standard_normal(3))
             new = factors.landmark_sighting(
-                X(k), L(i), SONAR, z, np.diag([4e-4, 8e-5]), kernel, None if i in seen else 0.3
+                X(k), L(i), sonar, z, np.diag([4e-4, 8e-5]), kernel, None if i in seen else 0.3
             )
             fed.add(new)
             seen.add(i)
         fed.smoother.update(float(k))
+        fed.live.append(fed.smoother.values.atPose3(X(k)))
     return fed

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, L, X
 
+from sonar_graph.slam.models import factors
 from sonar_graph.slam.smoother import FactorGroup, submap_window
 from sonar_graph.slam.smoother.batch_solution import picked
 from sonar_graph.slam.smoother.submap_window import Submap
@@ -163,16 +164,59 @@ def test_joined_submaps_are_least_squares():
 @pytest.mark.parametrize("bias_steps", [7, 1000])
 @pytest.mark.parametrize("most_rows", [0, 1000])
 def test_in_the_basin_the_window_stays_near_the_batch(monkeypatch, most_rows, bias_steps):
-    """After twenty circles, submaps joined and not: landmarks to half their sigmas, joint covariances to a tenth."""
+    """After three circles, submaps joined and not: landmarks to half their sigmas, joint covariances to a tenth.
+
+    That is the mean of four runs, since it depends on which submap was linearised anew last.
+    """
     monkeypatch.setattr(submap_window, "MOST_ROWS", most_rows)
-    fed, keys = in_the_basin(80, 4.0, bias_steps=bias_steps), [X(79), L(3), L(5), L(8)]
-    assert (len(fed.smoother._window._submaps) < 10) == (most_rows > 0)
-    batch, _ = fed.smoother.solve_history()
-    exact = fed.dense(batch, *keys)
+    off, keys = [], [X(79), L(3), L(5), L(8)]
+    for seed in range(4):
+        fed = in_the_basin(80, 4.0, seed=seed, bias_steps=bias_steps)
+        assert (len(fed.smoother._window._submaps) < 10) == (most_rows > 0)
+        batch, _ = fed.smoother.solve_history()
+        assert sigmas_off(fed) < 0.5
+        off.append(off_sigmas(fed.joint(*keys), fed.dense(batch, *keys)))
+    assert np.mean(off) < 0.1
+
+
+@pytest.fixture
+def heights_do_not_matter(monkeypatch):
+    """A submap is made of keyframes as soon as they are old enough."""
+    monkeypatch.setattr(submap_window, "MOST_BENT", np.inf)
+
+
+def jumps_m(seed: int, height_m: float) -> float:
+    """Root mean square distance of live poses, by a level sonar, from those of a smoother that keeps all poses."""
+    tracks = []
+    for lag_s in (4.0, 1e9):
+        fed = in_the_basin(60, lag_s, seed=seed, height_m=height_m, sonar=gtsam.Pose3())
+        tracks.append(np.array([pose.translation() for pose in fed.live]))
+    return float(np.sqrt(np.square(tracks[0] - tracks[1]).sum(axis=1).mean()))
+
+
+def test_among_landmarks_at_its_height_a_live_estimate_is_near_that_with_all_poses_kept(monkeypatch):
+    """A range tells the square of such a height: in submaps it would go up and down without end."""
+    found = [jumps_m(seed, -0.05) for seed in range(3)]
+    monkeypatch.setattr(submap_window, "MOST_BENT", np.inf)
+    control = [jumps_m(seed, -0.05) for seed in range(3)]
+    assert np.median(found) < 0.02
+    assert np.median(control) > 0.1
+
+
+def test_keyframes_become_a_submap_once_the_heights_of_what_they_see_are_known():
+    """In the order of time, whenever that is, and joined; the estimate stays that of all factors."""
+    fed = in_the_basin(40, 4.0, height_m=-0.05, sonar=gtsam.Pose3())
+    window = fed.smoother._window
+    waited = len(window._waiting)
+    assert waited > 5
     for i in (3, 5, 8):
-        sigma_m = np.sqrt(fed.dense(batch, L(i)).diagonal().max())
-        assert np.linalg.norm(fed.smoother.values.atPoint3(L(i)) - batch.atPoint3(L(i))) < 0.5 * sigma_m
-    assert off_sigmas(fed.joint(*keys), exact) < 0.1
+        fed.add({"height": factors.floor_prior(L(i), -0.05, 0.01)})
+    for _ in range(3 * waited):
+        fed.smoother.exchange(39.0)
+    ends = [submap.ends for submap in window._submaps]
+    assert ends == sorted(ends)
+    assert not window._waiting
+    assert sigmas_off(fed) < 0.1
 
 
 def sigmas_off(fed: Fed) -> float:
@@ -185,6 +229,7 @@ def sigmas_off(fed: Fed) -> float:
     return max(found)
 
 
+@pytest.mark.usefixtures("heights_do_not_matter")
 def test_settled_all_submaps_are_as_their_parts_are_now_however_deep(monkeypatch):
     """When none has been linearised anew since it was made."""
     monkeypatch.setattr(submap_window, "MOST_LOOKS", 0)
@@ -196,6 +241,7 @@ def test_settled_all_submaps_are_as_their_parts_are_now_however_deep(monkeypatch
     assert sigmas_off(fed) < 0.1
 
 
+@pytest.mark.usefixtures("heights_do_not_matter")
 def test_a_sighting_that_comes_when_its_keyframe_leaves_for_a_submap_counts():
     """In the very update in which it leaves; nothing is begun anew for it."""
     fed, late = in_the_basin(40, 4.0), []
@@ -251,6 +297,7 @@ def test_a_landmark_that_left_submaps_and_came_back_is_where_it_was():
     assert fed.smoother.values.atPoint3(L(5)) == pytest.approx(batch, abs=1e-3)
 
 
+@pytest.mark.usefixtures("heights_do_not_matter")
 def test_an_update_makes_one_submap_or_linearises_few_anew(monkeypatch):
     counts: list[int] = []
     linearise = Submap.linearise

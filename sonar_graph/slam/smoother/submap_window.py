@@ -8,14 +8,23 @@ linearised anew when its shape has changed. An update makes, joins or linearises
 
 from __future__ import annotations
 
-from collections import defaultdict
+import math
+from collections import defaultdict, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import islice
+from itertools import islice, pairwise
 from typing import Any
 
 import gtsam
+import numpy as np
 
-from sonar_graph.slam.smoother.batch_solution import is_bias, is_landmark, is_pose, picked, tangent_size
+from sonar_graph.slam.smoother.batch_solution import (
+    JointCovariance,
+    is_bias,
+    is_landmark,
+    is_pose,
+    picked,
+    tangent_size,
+)
 from sonar_graph.slam.smoother.fixed_lag import isam2_params, settle
 from sonar_graph.slam.smoother.submaps import BLAS, Factor, Submap
 
@@ -23,6 +32,19 @@ MOST_LOOKS = 2
 """Submaps that an update looks at, and linearises anew where they are stale."""
 MOST_ROWS = 120
 """Rows of what a joined submap shares with the rest, at most: it is dense."""
+MOST_BENT = 0.1
+"""Second-order term of a whitened sighting, over one sigma of its landmark's height: beyond it no submap is made."""
+
+
+def bending(sighting: gtsam.NoiseModelFactor, values: gtsam.Values, landmark: int, sigma_m: float) -> float:
+    """Second-order term of a whitened error, ``|e(l + sigma up) - 2 e(l) + e(l - sigma up)| / 2``."""
+    moved, errors = picked(values, sighting.keys()), []
+    for z_m in (-sigma_m, 0.0, sigma_m):
+        moved.update(landmark, values.atPoint3(landmark) + np.array([0.0, 0.0, z_m]))
+        errors.append(sighting.unwhitenedError(moved))
+    noise = sighting.noiseModel()
+    white = noise.noise() if isinstance(noise, gtsam.noiseModel.Robust) else noise
+    return 0.5 * float(np.linalg.norm(white.whiten(errors[0] - 2 * errors[1] + errors[2])))
 
 
 class SubmapWindow:
@@ -30,6 +52,7 @@ class SubmapWindow:
 
     def __init__(self, relinearize_threshold: float, lag_s: float, submap_keyframes: int) -> None:
         self._threshold = relinearize_threshold
+        self._height_sigmas_m: dict[int, float] = {}
         self.lag_s = lag_s
         """Age (s) from which on keyframes may leave for submaps."""
         self.size = submap_keyframes
@@ -47,6 +70,7 @@ class SubmapWindow:
         self._inside: dict[Submap, gtsam.Values] = {}
         self._whole: list[Submap] = []
         self._of: dict[int, Submap] = {}
+        self._waiting: deque[list[int]] = deque()
         self._newest: Submap | None = None
         self._stale = self._stale_in_turn()
         self._newest_bias = 0
@@ -86,7 +110,7 @@ class SubmapWindow:
         self._newest_bias = max(filter(is_bias, times_s), default=0)
         factors = [graph.at(i) for i in range(graph.size())]
         self._register(factors)
-        while self._grow(values, time_s):
+        while self._grow(values, time_s) or self._next_old(time_s):
             pass
         rest = gtsam.NonlinearFactorGraph()
         for factor in factors:
@@ -124,6 +148,8 @@ class SubmapWindow:
             else:
                 outside.append(factor)
         self._register(outside)
+        for key in values.keys():  # noqa: SIM118
+            self._height_sigmas_m.pop(key, None)
         self._newest_bias = max(filter(is_bias, times_s), default=self._newest_bias)
         known = gtsam.Values(values)
         known.insert_or_assign(self.estimate())
@@ -203,24 +229,68 @@ class SubmapWindow:
                 yield from self._stale_of(part)
             yield submap if submap.is_stale(self._around(submap, self.estimate())) else None
 
+    def _next_old(self, time_s: float) -> list[int]:
+        """Keyframes older than the lag that may become the next submap, with the one before and the one after it."""
+        keys = list(self._times_s)[: self.size + 2]
+        old = sum(t < time_s - self.lag_s for t in self._times_s.values())
+        return keys if old > self.size and len(keys) == self.size + 2 else []
+
     def _grow(self, estimate: gtsam.Values, time_s: float) -> bool:
-        """Make one submap: of the newest and its equal before it, else of keyframes older than the lag."""
+        """Make one submap: of the newest and its equal beside it, else of keyframes older than the lag."""
         if self._newest is not None:
             place = self._submaps.index(self._newest)
-            pair = tuple(self._submaps[max(place - 1, 0) : place + 1])
-            shared = {key for part in pair for factor in part.marginals for key in list(factor.keys())}
-            if len({part.level for part in pair}) < len(pair) and sum(map(tangent_size, shared)) <= MOST_ROWS:
-                self._add([pair[0].ends[1]], (pair[0].ends[0], pair[1].ends[1]), pair, estimate)
-                return True
+            for pair in pairwise(self._submaps[max(place - 1, 0) : place + 2]):
+                (first, middle), (joint, last) = (part.ends for part in pair)
+                shared = {key for part in pair for factor in part.marginals for key in list(factor.keys())}
+                fits = middle == joint and sum(map(tangent_size, shared)) <= MOST_ROWS
+                if fits and pair[0].level == pair[1].level:
+                    self._add([middle], (first, last), pair, estimate)
+                    return True
             self._newest = None
-        keys = list(self._times_s)
-        old = sum(t < time_s - self.lag_s for t in self._times_s.values())
-        if old <= self.size or len(keys) < self.size + 2:
+        if keys := self._next_old(time_s):
+            self._waiting.appendleft(keys)
+            for key in keys[:-1]:
+                del self._times_s[key]
+        if not self._waiting:
             return False
-        self._add(keys[1 : self.size + 1], (keys[0], keys[self.size + 1]), (), estimate)
-        for key in keys[: self.size + 1]:
-            del self._times_s[key]
+        keys = self._waiting.popleft()
+        if self._is_bent(keys, estimate):
+            self._waiting.append(keys)
+            return False
+        self._add(keys[1:-1], (keys[0], keys[-1]), (), estimate)
         return True
+
+    def _is_bent(self, keys: list[int], estimate: gtsam.Values) -> bool:
+        """True where keyframes see a landmark whose height is so little known that its range bends (`MOST_BENT`).
+
+        The height above the first keyframe; its sigma is asked for where the last one that is known is too large.
+        """
+        sightings = [
+            (factor, key)
+            for factor in dict.fromkeys(factor for key in keys[1:-1] for factor in self._on[key])
+            if isinstance(factor, gtsam.NoiseModelFactor)
+            for key in filter(is_landmark, list(factor.keys()))
+        ]
+        sigmas_m = self._height_sigmas_m
+
+        def bent() -> list[int]:
+            found = (
+                key
+                for factor, key in sightings
+                if key not in sigmas_m or not bending(factor, estimate, key, sigmas_m[key]) <= MOST_BENT
+            )
+            return list(dict.fromkeys(found))
+
+        if not (asked := bent()):
+            return False
+        if not all(map(self._isam.valueExists, [keys[0], *asked])):
+            return True
+        joint, up = JointCovariance.of(self._isam, [keys[0], *asked]), estimate.atPose3(keys[0]).rotation().matrix()[2]
+        of_pose = up @ joint.at(keys[0], keys[0])[3:, 3:] @ up
+        for key in asked:
+            variance = of_pose - 2 * up @ joint.at(keys[0], key)[3:, 2] + joint.at(key, key)[2, 2]
+            sigmas_m[key] = math.sqrt(max(0.0, variance))
+        return bool(bent())
 
     def _add(
         self, interior: list[int], ends: tuple[int, int], parts: tuple[Submap, ...], estimate: gtsam.Values
@@ -238,7 +308,7 @@ class SubmapWindow:
                 interior = [*interior, key]
                 factors |= self._on[key]
         submap = Submap(interior, factors, picked(estimate, interior), ends, parts)
-        place = self._submaps.index(parts[0]) if parts else len(self._submaps)
+        place = sum(submap.ends[1] <= ends[0] for submap in self._submaps)
         self._submaps[place : place + len(parts)] = [submap]
         self._whole.append(submap)
         self._newest = submap
