@@ -62,8 +62,9 @@ Settings = Annotated[
         "--set",
         metavar="NAME=VALUE",
         help="A setting of the recogniser, such as identity.unknown_prior=0.5 (sections: detection, tracking, "
-        "appearance, identity; a wrong name is answered with those that there are, and help(sonar_graph.sonar.recogniser) "
-        "explains them), or of actag: family, tag_size_m (side of the inner square), bit_corrections, pixels_per_bit; "
+        "appearance, identity; a wrong name is answered with those that there are, and "
+        "help(sonar_graph.sonar.recogniser) explains them), or of actag: family, tag_size_m "
+        "(side of the inner square), bit_corrections, pixels_per_bit; "
         "may be repeated.",
     ),
 ]
