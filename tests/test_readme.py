@@ -80,7 +80,7 @@ def test_commands_are_understood(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
     monkeypatch.chdir(tmp_path)
     Path("benchmarks/suites").mkdir(parents=True)
-    for name in ("dive.mcap", "dive.aris", "vehicle.toml", "benchmarks/suites/smoke.toml"):
+    for name in ("dive.mcap", "dive.aris", "joined.mcap", "vehicle.toml", "benchmarks/suites/smoke.toml"):
         Path(name).touch()
     group = typer.main.get_command(app)
     lines = re.findall(

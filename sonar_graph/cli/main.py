@@ -20,6 +20,7 @@ from sonar_graph.cli.compare import compare, demo, estimators, report, run
 from sonar_graph.cli.convert_data import datasets
 from sonar_graph.cli.inspect_log import inspect
 from sonar_graph.cli.join import join
+from sonar_graph.cli.label import label
 from sonar_graph.cli.recognise import calibrate, recognise
 from sonar_graph.cli.simulate import worlds
 from sonar_graph.errors import SonarGraphError
@@ -65,7 +66,13 @@ app.command(
         "sonar-graph recognise dive.mcap -o recognised.mcap --rule jeffrey",
     )
 )(recognise)
-app.command(epilog=examples("sonar-graph calibrate dive.mcap -o model.json"))(calibrate)
+app.command(epilog=examples("sonar-graph label dive.mcap -o labels.json"))(label)
+app.command(
+    epilog=examples(
+        "sonar-graph calibrate dive.mcap -o model.json",
+        "sonar-graph calibrate dive.mcap --labels labels.json -o model.json",
+    )
+)(calibrate)
 app.command(epilog=examples("sonar-graph report comparison"))(report)
 app.command(epilog=examples("sonar-graph estimators"))(estimators)
 app.command(epilog=examples("sonar-graph demo -o demo"))(demo)

@@ -195,28 +195,57 @@ def calibrate(
     ],
     output: Annotated[Path, typer.Option("--output", "-o", metavar="MODEL.json", help="File to write.")],
     reading: ReadingOptions,
+    labels: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="LABELS.json",
+            exists=True,
+            dir_okay=False,
+            help="Labels instead of a truth, as `label` writes them or as CSV; one file for each log, in their order.",
+        ),
+    ] = None,
+    motion: Motion = None,
     designs: DesignsPath = None,
     settings: Settings = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Measure how often landmarks look like which, on logs with sonar images whose truth is known."""
+    """Measure how often landmarks look like which, on logs with sonar images whose truth or labels are known."""
     from sonar_graph.recognition import calibrate as measure
+    from sonar_graph.recognition import calibrate_by_labels, read_labels
 
-    path = writable_json(output, logs, lambda content: "ids" in content and "matrix" in content, overwrite=overwrite)
+    sources = [*logs, *(labels or [])]
+    path = writable_json(output, sources, lambda content: "ids" in content and "matrix" in content, overwrite=overwrite)
     for row, log in enumerate(logs):
         if any(log.samefile(other) for other in logs[:row]):
             raise LogError(f"{log}: is named twice, and its frames would count twice; name each log once")
+    if labels and len(labels) != len(logs):
+        raise LogError(f"{len(logs)} logs and {len(labels)} files for --labels; give one for each log, in their order")
+    if motion is not None and not labels:
+        raise typer.BadParameter("--motion is for --labels: a log with truth has IMU and Doppler log")
     recognition = RecogniserOptions(designs)
-    params = recognition.params(settings)
+    params, known = recognition.params(settings), recognition.read_designs()
+    topic, salvage = reading.choices.get("sonar"), reading.salvage
     with working("calibrating"):
-        measured = measure(
-            [(log, reading.read(log, images=True)) for log in logs],
-            topic=reading.choices.get("sonar"),
-            config=reading.config,
-            designs=recognition.read_designs(),
-            params=params,
-            salvage=reading.salvage,
-        )
+        if labels:
+            given = [read_labels(file, log) for log, file in zip(logs, labels, strict=True)]
+            runs = [with_motion(log, reading, motion) for log in logs]
+            measured = calibrate_by_labels(
+                [(log, run, own, how) for log, own, (run, how) in zip(logs, given, runs, strict=True)],
+                topic=topic,
+                config=reading.config,
+                designs=known,
+                params=params,
+                salvage=salvage,
+            )
+        else:
+            measured = measure(
+                [(log, reading.read(log, images=True)) for log in logs],
+                topic=topic,
+                config=reading.config,
+                designs=known,
+                params=params,
+                salvage=salvage,
+            )
     with replacing(path) as partial:
         partial.write_text(measured.model_dump_json(indent=2) + "\n", encoding="utf-8")
     few = []

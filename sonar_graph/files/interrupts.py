@@ -52,6 +52,14 @@ def noticed_interrupts() -> Iterator[Callable[[], None]]:
         yield check
 
 
+def until_interrupted() -> None:
+    """Wait for a Ctrl-C, which is then no error: it is how the user ends what has no end."""
+    ended = threading.Event()
+    with _handling(lambda *_: ended.set()):
+        while not ended.wait(0.1):
+            pass
+
+
 @contextmanager
 def deferred_interrupt() -> Iterator[None]:
     """Defer a Ctrl-C that comes during the block to its end.

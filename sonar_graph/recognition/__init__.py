@@ -4,6 +4,8 @@
 from sonar_graph.recognition.clock_offset import ClockOffset, estimate_offset
 from sonar_graph.recognition.confusion_fit import calibrate
 from sonar_graph.recognition.image_motion import ImageMotions, MotionFrom, PlanarStep
+from sonar_graph.recognition.label_server import LabelDesk, LabelServer, shown_frames
+from sonar_graph.recognition.labels import Labels, calibrate_by_labels, read_labels
 from sonar_graph.recognition.recognition_record import (
     PICTURE_FOLDER, RECOGNITION, SURE, DrawnFrame, Recognition, read_recognition, write_recognition,
 )
@@ -12,7 +14,8 @@ from sonar_graph.recognition.session import (
 )
 
 __all__ = [
-    "ClockOffset", "DrawnFrame", "ImageMotions", "LandmarkRecogniser", "MotionFrom", "NO_FLOOR", "PICTURE_FOLDER",
-    "PlanarStep", "RECOGNITION", "Recognition", "SURE", "calibrate", "estimate_offset", "one_by_one",
-    "read_recognition", "recognise", "recognise_images", "with_detections", "write_recognition",
+    "ClockOffset", "DrawnFrame", "ImageMotions", "LabelDesk", "LabelServer", "Labels", "LandmarkRecogniser",
+    "MotionFrom", "NO_FLOOR", "PICTURE_FOLDER", "PlanarStep", "RECOGNITION", "Recognition", "SURE", "calibrate",
+    "calibrate_by_labels", "estimate_offset", "one_by_one", "read_labels", "read_recognition", "recognise",
+    "recognise_images", "shown_frames", "with_detections", "write_recognition",
 ]

@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
+import gtsam
 import numpy as np
 
 from sonar_graph.calibration import Calibration
@@ -220,6 +221,10 @@ class RecognitionSession:
         self._draws = pictures
         self.result = Recognition()
         self.recogniser = recogniser or Recogniser(sequence.calibration, designs, params)
+        self.start_T_sonar = gtsam.Pose3()
+        """Pose of the sonar at the last frame, in its axes at the first."""
+        self.view: FloorView | None = None
+        """View of the floor at the last frame, where it is known."""
         self._sonar = sequence.calibration.sonar
         self._motions: SonarMotions | ImageMotions
         if motion == "navigation" and isinstance(sequence, Run):
@@ -249,6 +254,9 @@ class RecognitionSession:
         if isinstance(self._motions, ImageMotions):
             self._motions.look(frame)
         step, view = self._motions.at(stamp_ns)
+        self.view = view
+        if step is not None:
+            self.start_T_sonar = self.start_T_sonar.compose(step.previous_T_sonar)
         frame = with_lens(frame, self._sonar.lens)
         self.result.outcomes[NO_FLOOR] += view is None
         found = self.recogniser.process(frame, step, view)

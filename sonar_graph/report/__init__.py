@@ -5,8 +5,9 @@ from sonar_graph.report.batch_page import write_batch_report
 from sonar_graph.report.batch_summary import lost_told, missing_told
 from sonar_graph.report.comparison_page import write_page, write_report
 from sonar_graph.report.console import published_counterpart, summary
+from sonar_graph.report.rendering import render
 
 __all__ = [
-    "lost_told", "missing_told", "published_counterpart", "summary", "write_batch_report", "write_page",
+    "lost_told", "missing_told", "published_counterpart", "render", "summary", "write_batch_report", "write_page",
     "write_report",
 ]

@@ -100,16 +100,6 @@ def test_every_command_that_writes_from_a_file_is_tried_in_the_tests_of_outputs(
     """A command that joins later must not be forgotten."""
     writing = {path[-1] for path, c in commands().items() if any(option.name == "output" for option in c.params)}
     of_folders, of_nothing = {"mrclam", "dlr", "akit", "stpere"}, {"basin", "demo"}
-    tried = {
-        "rosbag",
-        "didson",
-        "aris",
-        "oculus",
-        "victoria-park",
-        "compare",
-        "recognise",
-        "landmarks",
-        "calibrate",
-        "join",
-    }
+    converted = {"rosbag", "didson", "aris", "oculus", "victoria-park"}
+    tried = converted | {"compare", "recognise", "landmarks", "calibrate", "join", "label"}
     assert writing == tried | of_folders | of_nothing | {"run"}

@@ -62,7 +62,7 @@ def test_a_part_of_a_bag_or_a_log_under_another_ending_is_not_overwritten_either
     contents = foreign_log(part), basin.read_bytes()
     model.hardlink_to(basin)
     rosbag = ("convert", "rosbag", part.parent, "-o", part, "--overwrite")
-    for command in (rosbag, ("calibrate", basin, "-o", model)):
+    for command in (rosbag, ("calibrate", basin, "-o", model), ("label", basin, "-o", model)):
         assert run(*command) == 2
         assert "is what is read" in capsys.readouterr().err
     assert (part.read_bytes(), basin.read_bytes()) == contents

@@ -134,6 +134,25 @@ def test_a_model_that_calibrate_wrote_is_used(lane_log, run, tmp_path, monkeypat
     assert np.median(found.range_azimuth_cov[:, 0, 0]) < 0.05**2
 
 
+def test_labels_take_the_place_of_a_truth_and_mistakes_with_them_are_named(lane, lane_log, run, tmp_path, capsys):
+    model, given = tmp_path / "model.json", tmp_path / "labels.json"
+    stamp_ns = int(lane.frames.stamps_ns[40])
+    given.write_text(json.dumps({"log": "lane.mcap", "labels": []}))
+    for words, said in (
+        (("--labels", given), "0 of 0 labels met a track of the recogniser; too few labelled frames"),
+        (("--labels", given, "--labels", given), "1 logs and 2 files for --labels; give one for each log"),
+        (("--motion", "images"), "--motion is for --labels"),
+    ):
+        assert run("calibrate", lane_log, "-o", model, *words) == 2
+        assert said in capsys.readouterr().err
+    label = {"stamp_ns": stamp_ns, "range_m": 1.9, "azimuth_rad": 0.0, "id": 12}
+    given.write_text(json.dumps({"log": "lane.mcap", "labels": [label]}))
+    assert run("calibrate", lane_log, "-o", model, "--labels", given) == 2
+    assert "lane.mcap: its labels name landmark 12, the designs are 1, 2, 3, 4" in capsys.readouterr().err
+    assert run("label", lane_log, "-o", given.rename(tmp_path / "other.json").with_name("model.toml")) == 2
+    assert "expected the name of a file that ends in .json" in capsys.readouterr().err
+
+
 def test_designs_of_ones_own_and_settings_need_no_code(lane_log, run, tmp_path, capsys):
     (tmp_path / "mine.toml").write_text(DESIGNS)
     assert run("recognise", lane_log, "-o", tmp_path / "out.mcap", "--designs", tmp_path / "mine.toml") == 0

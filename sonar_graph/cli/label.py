@@ -1,0 +1,111 @@
+"""``sonar-graph label``: a page on which landmarks in sonar images are labelled by clicks."""
+
+from __future__ import annotations
+
+import webbrowser
+from pathlib import Path
+from threading import Thread
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from sonar_graph.cli.arguments import DesignsPath, LogPath, Overwrite, ReadingOptions, echo, with_options
+from sonar_graph.cli.outputs import progress_bars, writable_json
+from sonar_graph.errors import LogError
+from sonar_graph.files import until_interrupted
+
+if TYPE_CHECKING:
+    from sonar_graph.devices import LandmarkDesign
+    from sonar_graph.recognition import LabelDesk, Labels, LabelServer
+
+NONE = "none"
+NONE_TEXT = "none of them"
+
+
+@with_options()
+def label(
+    log: LogPath,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="LABELS.json", help="File of the labels.")],
+    reading: ReadingOptions,
+    designs: DesignsPath = None,
+    period: Annotated[
+        float, typer.Option(metavar="SECONDS", min=0.0, help="Shortest time between the frames that are shown.")
+    ] = 0.5,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port on 127.0.0.1; 0: any that is free.")] = 0,
+    no_browser: Annotated[bool, typer.Option("--no-browser", help="Only print the address.")] = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """Click landmarks in a log's sonar images, on a page in the browser; labels are saved after every click.
+
+    A file of labels that exists is continued. `calibrate --labels` measures the model of recognition by it.
+    """
+    from sonar_graph.devices import DEFAULT_DESIGNS, load_designs
+    from sonar_graph.files import spelt
+    from sonar_graph.logs import no_images, read_images_alone, read_sonar_frames
+    from sonar_graph.recognition import LabelDesk, Labels, LabelServer, read_labels, shown_frames
+
+    path = writable_json(output, [log], lambda content: content.keys() == {"log", "labels"}, overwrite=overwrite)
+    known = DEFAULT_DESIGNS if designs is None else load_designs(designs)
+    is_continued = path.exists() and path.stat().st_size and not overwrite
+    labels = read_labels(path, log) if is_continued else Labels(log=spelt(log.name))
+    topic = reading.choices.get("sonar")
+    alone = read_images_alone(
+        log,
+        calibration=reading.given,
+        topic=topic,
+        config=reading.config,
+        window=reading.window,
+        salvage=reading.salvage,
+    )
+    blocks = read_sonar_frames(
+        log, topic, reading.config, window=reading.window, salvage=reading.salvage, refused=lambda *_: None
+    )
+    with progress_bars() as progress:
+        frames = shown_frames(
+            blocks,
+            alone.calibration.sonar,
+            round(period * 1e9),
+            lambda done: progress("drawing frames", done, 0),
+        )
+    if not frames:
+        raise LogError(no_images(log))
+    desk = LabelDesk(frames, labels, path)
+    with LabelServer(
+        desk, lambda nonce: page_of(log, path, known, desk, nonce), [one.id for one in known], port
+    ) as server:
+        serve(server, log, path, labels, is_shown=not no_browser)
+
+
+def serve(server: LabelServer, log: Path, path: Path, labels: Labels, *, is_shown: bool) -> None:
+    """Serve until Ctrl-C, then say what there is."""
+    echo(f"{len(server.desk.frames)} frames, {len(labels.labels)} labels so far. The page: {server.address}")
+    echo("Ctrl-C ends.")
+    if is_shown:
+        webbrowser.open(server.address)
+    serving = Thread(target=server.serve_forever, daemon=True)
+    serving.start()
+    until_interrupted()
+    server.shutdown()
+    echo(f"\nLabels: {path} ({len(server.desk.labels)})")
+    echo(f"Next: sonar-graph calibrate {log} --labels {path} -o model.json")
+
+
+def page_of(log: Path, path: Path, designs: tuple[LandmarkDesign, ...], desk: LabelDesk, nonce: str) -> str:
+    """The page as text."""
+    from sonar_graph.report import render
+
+    choices = [
+        (str(row) if row < 10 else "", str(design.id), f"{design.id}: {design.name}")
+        for row, design in enumerate(designs, 1)
+    ]
+    content = {
+        "kind": "labels",
+        "name": log.name,
+        "names": [path.name],
+        "file": path.name,
+        "none_text": NONE_TEXT,
+        "nonce": nonce,
+        "choices": [*choices, ("0", NONE, NONE_TEXT)],
+        "seconds": [round((frame.stamp_ns - desk.frames[0].stamp_ns) * 1e-9, 3) for frame in desk.frames],
+    }
+    return render("label.html", content)

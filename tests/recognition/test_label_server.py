@@ -1,0 +1,207 @@
+"""The page on which landmarks are labelled: who may ask it, what it saves, and the clicks of a real browser.
+
+Chromium comes from the system, as in tests/report/test_page_in_browser.py.
+"""
+
+import json
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from threading import Thread
+
+import numpy as np
+import pytest
+
+from sonar_graph.recognition.label_server import LabelDesk, LabelServer, ShownFrame, shown_frames
+from sonar_graph.recognition.labels import Labels, read_labels
+from sonar_graph.recognition.session import one_by_one
+
+BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+IDS = [1, 2, 3, 4]
+
+
+@pytest.fixture(scope="module")
+def frames(lane) -> list[ShownFrame]:
+    blocks = [lane.one(row) for row in range(20)]
+    return shown_frames(blocks, lane.sequence.calibration.sonar, 500_000_000, lambda _: None)
+
+
+@pytest.fixture
+def server(frames, tmp_path) -> Iterator[LabelServer]:
+    desk = LabelDesk(frames, Labels(log="lane.mcap"), tmp_path / "labels.json")
+    with LabelServer(desk, lambda nonce: f"<script nonce={nonce}></script>", IDS) as made:
+        Thread(target=made.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
+        yield made
+        made.shutdown()
+
+
+def ask(server: LabelServer, path: str, content: object = None, **headers: str) -> tuple[int, bytes]:
+    """Status and body of an answer."""
+    address = path if path.startswith("http") else server.address + path
+    body = None if content is None else json.dumps(content).encode()
+    kind = {} if content is None else {"Content-Type": "application/json"}
+    request = urllib.request.Request(address, body, {**kind, **headers})
+    try:
+        with urllib.request.urlopen(request, timeout=10) as answer:
+            return answer.status, answer.read()
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, error.read()
+
+
+def test_frames_are_a_period_apart_and_their_pixels_are_where_ranges_and_azimuths_are(frames, lane):
+    stamps = np.array([frame.stamp_ns for frame in frames])
+    assert stamps[0] == lane.frames.stamps_ns[0]
+    assert np.diff(stamps).min() >= 500_000_000
+    for range_m, azimuth_rad in ((1.4, 0.1), (2.0, -0.2), (2.4, 0.0)):
+        found = frames[0].range_azimuth(*frames[0].fan.pixel(range_m, azimuth_rad))
+        np.testing.assert_allclose(found, (range_m, azimuth_rad), atol=0.003)
+    assert frames[0].range_azimuth(0.0, frames[0].fan.beam.shape[0] - 1.0) is None
+
+
+def test_of_many_frames_those_that_are_shown_are_spread_over_the_log(lane, monkeypatch):
+    monkeypatch.setattr("sonar_graph.recognition.label_server.MOST_FRAMES", 10)
+    shown = shown_frames(one_by_one(lane.frames), lane.sequence.calibration.sonar, 0, lambda _: None)
+    assert 4 <= len(shown) <= 10
+    assert shown[-1].stamp_ns > lane.frames.stamps_ns[-1] - 10_000_000_000
+
+
+def test_only_who_knows_the_word_and_names_the_host_is_answered(server):
+    other = f"http://{server.host}/"
+    assert ask(server, "")[0] == 200
+    assert ask(server, "frame/0")[1][:2] == b"\xff\xd8"
+    for path in (
+        other,
+        f"{other}state",
+        f"{other}{server.word}x/state",
+        f"{other}{server.word}",
+        server.address + "../x",
+    ):
+        assert ask(server, path)[0] == 404
+    assert ask(server, "state", Host="evil.example")[0] == 404
+    click = {"frame": 0, "column": 150, "row": 300, "id": 1}
+    assert ask(server, f"{other}label", click)[0] == 404
+    assert ask(server, "label", click, Origin="http://evil.example")[0] == 400
+    assert ask(server, "label", click, **{"Content-Type": "text/plain"})[0] == 400
+    assert server.desk.labels == ()
+    assert server.server_address[0] == "127.0.0.1"
+
+
+def test_requests_that_make_no_sense_are_refused(server):
+    click = {"frame": 0, "column": 150, "row": 300, "id": 1}
+    for changed in (
+        {"frame": 99},
+        {"frame": -1},
+        {"frame": "x"},
+        {"column": "a"},
+        {"id": 9},
+        {"id": [1]},
+        {"row": None},
+    ):
+        assert ask(server, "label", click | changed)[0] == 400
+    assert ask(server, "label", [1])[0] == 400
+    assert ask(server, "label", {"frame": "1" * 20_000})[0] == 400
+    assert ask(server, "frame/99")[0] == ask(server, "frame/-1")[0] == ask(server, "labels", click)[0] == 404
+    assert server.desk.labels == ()
+
+
+def test_each_click_is_saved_and_can_be_taken_back(server, tmp_path):
+    click = {"frame": 1, "column": 300, "row": 300, "id": 2}
+    assert json.loads(ask(server, "label", click)[1])["total"] == 1
+    state = json.loads(ask(server, "label", click | {"id": None, "frame": 2})[1])
+    assert [len(labels) for labels in state["frames"][:4]] == [0, 1, 1, 0]
+    assert abs(state["frames"][1][0]["column"] - 300) <= 1
+    saved = read_labels(tmp_path / "labels.json", Path("lane.mcap"))
+    assert [label.id for label in saved.labels] == [2, None]
+    assert saved.labels[0].stamp_ns == server.desk.frames[1].stamp_ns
+    assert json.loads(ask(server, "label", click | {"column": 0, "row": 600})[1])["fault"] == "outside of the image"
+    assert json.loads(ask(server, "take-back", {"frame": 2})[1])["total"] == 1
+    assert json.loads(ask(server, "take-back", {"frame": 2})[1])["fault"] == "no label in this frame"
+    assert [label.id for label in read_labels(tmp_path / "labels.json", Path("lane.mcap")).labels] == [2]
+
+
+def test_what_cannot_be_saved_is_said_and_not_kept(server, monkeypatch):
+    def full(*_: object) -> None:
+        raise OSError("no space left")
+
+    monkeypatch.setattr(Labels, "write", full)
+    answer = json.loads(ask(server, "label", {"frame": 1, "column": 300, "row": 300, "id": 2})[1])
+    assert answer["fault"] == "not saved: no space left"
+    assert answer["total"] == 0
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium: apt install chromium")
+def test_landmarks_are_clicked_in_a_browser_and_the_command_ends_by_ctrl_c_and_goes_on_later(lane_log, tmp_path):
+    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
+    out = tmp_path / "labels.json"
+    for before in (0, 2):
+        words = [sys.executable, "-m", "sonar_graph", "label", str(lane_log), "-o", str(out), "--no-browser"]
+        command = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        try:
+            line = command.stdout.readline()
+            assert f"{before} labels so far" in line
+            with sync_api.sync_playwright() as playwright:
+                browser = playwright.chromium.launch(executable_path=BROWSER, args=["--no-sandbox"])
+                click_two(browser, re.search(r"http://127\.0\.0\.1:\d+/\S+/", line)[0], before)
+                browser.close()
+            command.send_signal(signal.SIGINT)
+            said, complaints = command.communicate(timeout=20)
+        finally:
+            command.kill()
+        assert (command.returncode, complaints) == (0, "")
+        assert f"Labels: {out} ({before + 2})" in said
+    ids = [label.id for label in read_labels(out, lane_log).labels]
+    assert ids == [3, None, 3, None]
+
+
+def click_two(browser, address: str, before: int) -> None:
+    page = browser.new_page(viewport={"width": 1280, "height": 900})
+    said: list[str] = []
+    page.on("console", lambda message: said.append(message.text))
+    page.on("pageerror", lambda error: said.append(str(error)))
+    page.goto(address)
+    status = page.locator("#said")
+    until(lambda: page.evaluate("document.getElementById('picture').naturalWidth") > 0)
+    if before:
+        until(lambda: status.text_content() == f"{before} labels so far")
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("PageDown")
+    page.keyboard.press("PageUp")
+    assert page.locator("#where").text_content().startswith("2 of ")
+    page.keyboard.press("3")
+    assert page.locator("input[value='3']").is_checked()
+    box = page.locator("#picture").bounding_box()
+    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.click(*middle)
+    until(lambda: status.text_content() == f"saved: {before + 1} labels")
+    page.keyboard.press("0")
+    page.mouse.click(middle[0], middle[1] + 40)
+    page.mouse.click(middle[0], middle[1] + 60)
+    until(lambda: status.text_content() == f"saved: {before + 3} labels")
+    page.keyboard.press("Backspace")
+    until(lambda: status.text_content() == f"saved: {before + 2} labels")
+    assert page.locator("#marks circle").count() == before + 2
+    mark = page.locator("#marks circle").nth(before).bounding_box()
+    assert abs(mark["x"] + mark["width"] / 2 - middle[0]) < 3
+    assert abs(mark["y"] + mark["height"] / 2 - middle[1]) < 3
+    for width in (390, 1280):
+        page.set_viewport_size({"width": width, "height": 900})
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+    assert said == []
+
+
+def until(holds) -> None:
+    """Wait until something holds; the page's policy allows no strings as code, by which playwright would wait."""
+    for _ in range(500):
+        if holds():
+            return
+        time.sleep(0.02)
+    raise AssertionError("it never held")
