@@ -182,14 +182,16 @@ def climbed(
 
 @compiled
 def correlation(level: Floats32, seen: Floats32, cells: Ints, offset: int, picture: Floats32) -> float:
-    """Correlation of a template with the seen cells of a patch."""
-    n, a, b, aa, bb, ab = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    """Correlation of a template with the seen cells of a patch, whose levels are 0 elsewhere."""
+    zero = np.float32(0.0)
+    n, a, b, aa, bb, ab = zero, zero, zero, zero, zero, zero
     for c in range(len(cells)):
-        if seen[cells[c] + offset] > 0:
-            one, other = level[cells[c] + offset], picture[c]
-            n, a, b, aa, bb, ab = n + 1, a + one, b + other, aa + one * one, bb + other * other, ab + one * other
+        at = np.uint32(cells[c] + offset)
+        one, held, other = level[at], seen[at], picture[c]
+        n, a, b = n + held, a + one, b + held * other
+        aa, bb, ab = aa + one * one, bb + held * other * other, ab + one * other
     scale2 = (n * aa - a * a) * (n * bb - b * b)
-    return (n * ab - a * b) / math.sqrt(scale2) if scale2 > 0 else -1.0
+    return float((n * ab - a * b) / math.sqrt(scale2)) if scale2 > 0 else -1.0
 
 
 @compiled
