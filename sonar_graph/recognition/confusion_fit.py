@@ -215,7 +215,9 @@ def estimate_confusion(
     odds = np.pad(fits.evidence @ weights, ((0, 0), (0, 1)))
     matrix = confusion_rows(soft_scores(odds, looks), fits.label, trials)
     height_bias_m, error = without_height(fits)
-    sigmas = np.sqrt(np.nanmean((error * fits.visible[:, None] ** 2) ** 2, axis=0))
+    seen = max(int(tracks[:-1].sum()), 2)
+    mean_squares = np.nanmean((error * fits.visible[:, None] ** 2) ** 2, axis=0)
+    sigmas = np.sqrt(mean_squares * seen / (seen - 1))  # errors of a track repeat, and the bias is that of these tracks
     return Confusion(
         ids=ids,
         designs=tuple(map(mark_of, designs)),
