@@ -16,6 +16,9 @@ from sonar_graph.cli.arguments import echo, printable
 from sonar_graph.errors import EvaluationError, LogError, SonarGraphError
 from sonar_graph.files import COMPARISON, read_json, result_folder
 
+OWN_PAGE = '<p class="kicker">sonar_graph recognition</p>'
+"""Line of every page of tracks."""
+
 
 def writable_log(path: Path, *sources: Path | None, overwrite: bool = False) -> Path:
     """Check that a log can be written, say whether it replaces another, and return ``path``.
@@ -58,6 +61,22 @@ def writable_json(
             raise EvaluationError(
                 f"{path}: exists, and sonar-graph did not write it; choose another name, or give --overwrite"
             )
+    _require_writing_in(path.parent, path, EvaluationError)
+    return path
+
+
+def writable_page(path: Path, *, overwrite: bool = False) -> Path:
+    """Check that a page can be written, and return ``path``.
+
+    Raises `EvaluationError` when it is a folder, is not called ``*.html``, cannot be written, or is a file that this
+    package did not write.
+    """
+    if path.is_dir() or path.suffix != ".html":
+        raise EvaluationError(f"{path}: expected the name of a file that ends in .html")
+    if not overwrite and path.exists() and OWN_PAGE not in path.read_text("utf-8", errors="replace"):
+        raise EvaluationError(
+            f"{path}: exists, and sonar-graph did not write it; choose another name, or give --overwrite"
+        )
     _require_writing_in(path.parent, path, EvaluationError)
     return path
 

@@ -23,15 +23,16 @@ from sonar_graph.cli.arguments import (
     validated,
     with_options,
 )
-from sonar_graph.cli.outputs import progress_bars, working, writable_json, writable_log
+from sonar_graph.cli.outputs import progress_bars, working, writable_json, writable_log, writable_page
 from sonar_graph.errors import LogError
 from sonar_graph.files import replacing
 
 if TYPE_CHECKING:
     from sonar_graph.calibration import Calibration
     from sonar_graph.devices import LandmarkDesign
+    from sonar_graph.images import SonarFrames
     from sonar_graph.logs import ImagesAlone
-    from sonar_graph.recognition import LandmarkRecogniser, MotionFrom, Recognition
+    from sonar_graph.recognition import LandmarkRecogniser, MotionFrom, Recognition, TrackStories
     from sonar_graph.sequence import Sequence
     from sonar_graph.sonar import RecogniserParams
 
@@ -136,6 +137,10 @@ def recognise(
     recogniser: RecogniserName = "designs",
     motion: Motion = None,
     settings: Settings = None,
+    report: Annotated[
+        Path | None,
+        typer.Option(metavar="PAGE.html", help="Page to write: every track with picture, probabilities and fate."),
+    ] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Recognise landmarks in a log's sonar images; write the log anew with the detections in it.
@@ -144,12 +149,18 @@ def recognise(
     the images.
     """
     from sonar_graph.logs import DETECTIONS, METADATA, detection_messages, no_images, with_notes, write_amended
+    from sonar_graph.recognition import TrackStories
+    from sonar_graph.report.tracks import write_track_page
+    from sonar_graph.sonar import Recogniser
 
     path = writable_log(output, log, overwrite=overwrite)
+    page = None if report is None else writable_page(report, overwrite=overwrite)
     sequence, motion = with_motion(log, reading, motion)
-    found = recognise_log(
-        log, sequence, reading, recognition.recogniser(sequence.calibration, settings, recogniser), motion
-    )
+    made = recognition.recogniser(sequence.calibration, settings, recogniser)
+    stories = TrackStories(sequence.calibration.sonar.image) if page else None
+    if stories is not None and not isinstance(made, Recogniser):
+        raise typer.BadParameter("--report shows the tracks of the recogniser of designs; actag has none")
+    found = recognise_log(log, sequence, reading, made, motion, stories)
     if found is None:
         raise LogError(no_images(log))
     with working("writing"):
@@ -185,6 +196,10 @@ def recognise(
         echo(f"Replaced: {count} messages that the log had on {topic}")
     for note in amended.notes.values():
         echo(f"Not copied: {note}")
+    if page is not None and stories is not None and isinstance(made, Recogniser):
+        names = [f"{design.id}: {design.name}" for design in made.designs]
+        write_track_page(page, log.name, found, stories, names, sequence.start_ns)
+        echo(f"Page: {page}")
     echo(f"Log: {path}")
 
 
@@ -309,9 +324,15 @@ def recognise_log(
     reading: ReadingOptions,
     recogniser: LandmarkRecogniser,
     motion: MotionFrom = "navigation",
+    stories: TrackStories | None = None,
 ) -> Recognition | None:
     """Landmarks in a log's sonar images, with a progress bar; None without images."""
     from sonar_graph.recognition import recognise_images
+    from sonar_graph.sonar import Recogniser
+
+    def see(frame: SonarFrames) -> None:
+        if stories is not None and isinstance(recogniser, Recogniser):
+            stories.see(frame, recogniser)
 
     with progress_bars() as progress:
         return recognise_images(
@@ -324,6 +345,7 @@ def recognise_log(
             window=reading.window,
             salvage=reading.salvage,
             progress=lambda done: progress("recognising landmarks (frames)", done, 0),
+            seen=see,
         )
 
 

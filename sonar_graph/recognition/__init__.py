@@ -12,10 +12,11 @@ from sonar_graph.recognition.recognition_record import (
 from sonar_graph.recognition.session import (
     NO_FLOOR, LandmarkRecogniser, one_by_one, recognise, recognise_images, with_detections,
 )
+from sonar_graph.recognition.track_stories import TrackStories, TrackStory
 
 __all__ = [
     "ClockOffset", "DrawnFrame", "ImageMotions", "LabelDesk", "LabelServer", "Labels", "LandmarkRecogniser",
-    "MotionFrom", "NO_FLOOR", "PICTURE_FOLDER", "PlanarStep", "RECOGNITION", "Recognition", "SURE", "calibrate",
-    "calibrate_by_labels", "estimate_offset", "one_by_one", "read_labels", "read_recognition", "recognise",
-    "recognise_images", "shown_frames", "with_detections", "write_recognition",
+    "MotionFrom", "NO_FLOOR", "PICTURE_FOLDER", "PlanarStep", "RECOGNITION", "Recognition", "SURE", "TrackStories",
+    "TrackStory", "calibrate", "calibrate_by_labels", "estimate_offset", "one_by_one", "read_labels",
+    "read_recognition", "recognise", "recognise_images", "shown_frames", "with_detections", "write_recognition",
 ]

@@ -24,6 +24,9 @@ NONE = -1
 LEAST_NAMED = 0.5
 """Posterior above which a detection counts as naming a landmark."""
 
+FEWEST_TRACKS, MOSTLY = 10, 0.9
+"""Number of reported tracks, and share of them without a landmark, from which images are doubted."""
+
 
 @dataclass(frozen=True, eq=False)
 class DrawnFrame:
@@ -80,7 +83,24 @@ class Recognition:
             if unknown:
                 listed = ", ".join(map(str, unknown))
                 lines.append(f"Warning: the log has landmarks {listed}, of which there is no design; give --designs")
+        if (line := self.unlike_the_model()) is not None:
+            lines.append(line)
         return lines
+
+    def unlike_the_model(self) -> str | None:
+        """Warning where nearly all tracks are of no landmark; None else, and for few tracks."""
+        if self.detections is None:
+            return None
+        last = {track: row for row, track in enumerate(self.detections.track.tolist())}
+        none = 1 - self.detections.id_probability[list(last.values())].sum(axis=1)
+        count = int(np.count_nonzero(none > LEAST_NAMED))
+        if len(last) < FEWEST_TRACKS or count < MOSTLY * len(last):
+            return None
+        return (
+            f"Warning: {count} of {len(last)} tracks are of no landmark: the images may be unlike those that the model "
+            "was measured on; `sonar-graph label` and `calibrate --labels` measure it on these, and `recognise "
+            "--report PAGE.html` shows the tracks"
+        )
 
     def entry(self) -> dict[str, Any]:
         """Content for JSON, without detections and pictures."""

@@ -155,15 +155,17 @@ def recognise_images(
     window: TimeWindow | None = None,
     salvage: bool = False,
     progress: Callable[[int], None] | None = None,
+    seen: Callable[[SonarFrames], None] | None = None,
 ) -> Recognition | None:
     """Recognise landmarks in sonar images, with a record of what became of every candidate and frame.
 
     Parameters and errors are those of `recognise`, with the topic of the images and the window and salvage of the
-    sequence; ``progress`` is called with the number of frames done. None where there are no images.
+    sequence; ``progress`` is called with the number of frames done, ``seen`` with each frame after it was used.
+    None where there are no images.
 
     Without IMU and Doppler log (`ImagesAlone`) the motion is from the images; "fixed" is of a sonar at rest.
     """
-    session = RecognitionSession(sequence, designs, params, recogniser=recogniser, motion=motion)
+    session = RecognitionSession(sequence, designs, params, recogniser=recogniser, motion=motion, seen=seen)
     if isinstance(images, Path | str):
         images = read_sonar_frames(Path(images), topic, config, window=window, salvage=salvage, refused=session.refuse)
     for _ in session.run(images):
@@ -217,8 +219,9 @@ class RecognitionSession:
         recogniser: LandmarkRecogniser | None = None,
         pictures: bool = True,
         motion: MotionFrom = "navigation",
+        seen: Callable[[SonarFrames], None] | None = None,
     ) -> None:
-        self._draws = pictures
+        self._draws, self._seen = pictures, seen
         self.result = Recognition()
         self.recogniser = recogniser or Recogniser(sequence.calibration, designs, params)
         self.start_T_sonar = gtsam.Pose3()
@@ -269,6 +272,8 @@ class RecognitionSession:
                 self.result.outcomes[fate.outcome] += 1
         if found is not None:
             self._blocks.append(found)
+        if self._seen is not None and is_used:
+            self._seen(frame)
         if self._draws and is_used:
             self._draw(frame, found)
         return found

@@ -5,11 +5,11 @@ from sonar_graph.sonar.actag import AcTagRecogniser, AcTagSettings
 from sonar_graph.sonar.appearance import SLANT_PLANE, ObjectSighting
 from sonar_graph.sonar.confusion import Confusion, mark_of, posterior_mean_rows, read_confusion, soft_scores
 from sonar_graph.sonar.geometry import Fan, FloorView, with_lens
-from sonar_graph.sonar.recogniser import Fate, Recogniser, RecogniserParams
+from sonar_graph.sonar.recogniser import REPORTED, Fate, Recogniser, RecogniserParams
 from sonar_graph.sonar.track_filter import SonarStep
 
 __all__ = [
-    "AcTagRecogniser", "AcTagSettings", "Confusion", "Fan", "Fate", "FloorView", "ObjectSighting", "Recogniser",
-    "RecogniserParams", "SLANT_PLANE", "SonarStep", "mark_of", "posterior_mean_rows", "read_confusion", "soft_scores",
-    "with_lens",
+    "AcTagRecogniser", "AcTagSettings", "Confusion", "Fan", "Fate", "FloorView", "ObjectSighting", "REPORTED",
+    "Recogniser", "RecogniserParams", "SLANT_PLANE", "SonarStep", "mark_of", "posterior_mean_rows", "read_confusion",
+    "soft_scores", "with_lens",
 ]

@@ -128,6 +128,8 @@ class Recogniser:
         """Numbers of these tracks."""
         self.news: Floats = np.empty(0)
         """Independent share of the last frame for these tracks."""
+        self.beliefs: Floats = np.empty((0, len(self.ids) + 1))
+        """Probability of each landmark and of none of them for these tracks, shape (M, ids + 1)."""
 
     def process(
         self, frame: SonarFrames, motion: SonarStep | None = None, view: FloorView | None = None
@@ -157,6 +159,7 @@ class Recogniser:
         check_block(frame)
         self.stamp_ns = stamp_ns = int(frame.stamps_ns[0])
         self.sightings, self.track_ids, self.news = [], np.empty(0, dtype=np.int64), np.empty(0)
+        self.beliefs = np.empty((0, len(self.ids) + 1))
         if motion is not None:
             self._start_T_sonar = self._start_T_sonar.compose(motion.previous_T_sonar)
         if (fault := self._check.fault(frame)) is not None:
@@ -176,6 +179,7 @@ class Recogniser:
         sideways = np.asarray(across @ self._start_T_sonar.rotation().matrix().T)
         beliefs = self._beliefs.step(association, log_odds, places, sideways)
         self.news = self._beliefs.weights
+        self.beliefs = each_once(beliefs)
         found = self._report(candidates, association, beliefs)
         if self._check.change is not None:
             self.fates.append(Fate(stamp_ns, -1, np.nan, np.nan, self._check.change))

@@ -184,6 +184,19 @@ def test_images_alone_are_recognised_and_what_is_lost_is_said(lane, run, tmp_pat
     assert topics == {TOPIC, "/sonar/landmarks"}
 
 
+def test_a_page_of_the_tracks_is_written_and_replaces_only_its_own(lane_log, run, tmp_path, capsys):
+    page, out = tmp_path / "page.html", tmp_path / "out.mcap"
+    page.write_text("mine")
+    assert run("recognise", lane_log, "-o", out, "--report", page) == 2
+    assert "page.html: exists, and sonar-graph did not write it" in capsys.readouterr().err
+    assert run("recognise", lane_log, "-o", out, "--report", tmp_path / "page.pdf") == 2
+    assert "expected the name of a file that ends in .html" in capsys.readouterr().err
+    for more in (("--overwrite",), ()):
+        assert run("recognise", lane_log, "-o", out, "--report", page, *more) == 0
+        assert f"Page: {page}" in capsys.readouterr().out
+        assert 'id="track-0"' in page.read_text()
+
+
 class Decoder:
     """In place of AcTag: sees tag 5 in every frame."""
 

@@ -1,0 +1,113 @@
+"""What became of every track and candidate in a log's images, with a picture of each, to be looked at."""
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from sonar_graph.calibration import SonarImage
+from sonar_graph.images import SonarFrames, decibels
+from sonar_graph.measurements import NS_PER_S, Floats
+from sonar_graph.recognition.recognition_record import as_jpeg, draw_fan
+from sonar_graph.sonar import Fan, Recogniser
+
+HALF_M = 0.35
+"""Half of the side of a picture."""
+SIDE_PIXELS = 160
+MOST_EXAMPLES = 6
+"""Pictures of candidates rejected for one reason."""
+EXAMPLE_PERIOD_NS = 5 * NS_PER_S
+"""Least time between these."""
+BETTER = 0.05
+"""Rise of the visible share with which a track is drawn anew."""
+
+
+@dataclass
+class TrackStory:
+    """A track from its first frame to its last."""
+
+    number: int
+    first_ns: int
+    last_ns: int = 0
+    frames: int = 0
+    """Frames in which it took a candidate."""
+    visible: float = -1.0
+    """Share in view at its picture."""
+    jpeg: bytes = b""
+    beliefs: Floats = field(default_factory=lambda: np.empty(0))
+    """Last probability of each landmark and of none of them, shape (ids + 1,)."""
+    outcomes: Counter[str] = field(default_factory=Counter)
+    """Number of frames by what became of it in them; the reason of its end."""
+
+
+@dataclass
+class Rejected:
+    """Candidates that were rejected for one reason."""
+
+    count: int = 0
+    examples: list[tuple[int, bytes]] = field(default_factory=list)
+    """Stamps and pictures of some."""
+
+
+class TrackStories:
+    """Collector of stories: `see` after every frame of a recogniser."""
+
+    def __init__(self, image: SonarImage) -> None:
+        self.tracks: dict[int, TrackStory] = {}
+        self.rejected: dict[str, Rejected] = {}
+        self._image = image
+        self._fan: tuple[SonarFrames, Fan] | None = None
+
+    def see(self, frame: SonarFrames, recogniser: Recogniser) -> None:
+        """Take in what a recogniser made of a block of one frame."""
+        stamp_ns, views = int(frame.stamps_ns[0]), _Views(frame, self._image, self._fan_of(frame))
+        if recogniser.stamp_ns != stamp_ns:
+            return
+        rows = zip(recogniser.track_ids.tolist(), recogniser.sightings, recogniser.beliefs, strict=True)
+        for number, sighting, beliefs in rows:
+            story = self.tracks.setdefault(number, TrackStory(number, stamp_ns))
+            story.beliefs = beliefs
+            if sighting is None:
+                continue
+            story.last_ns, story.frames = stamp_ns, story.frames + 1
+            visible = 0.0 if sighting.fit is None else sighting.fit.visible
+            if visible > story.visible + BETTER:
+                story.visible, story.jpeg = visible, views.around(sighting.range_m, sighting.azimuth_rad)
+        for fate in recogniser.fates:
+            if fate.track in self.tracks:
+                self.tracks[fate.track].outcomes[fate.outcome] += 1
+            elif fate.track < 0 and np.isfinite(fate.range_m):
+                found = self.rejected.setdefault(fate.outcome, Rejected())
+                found.count += 1
+                is_due = not found.examples or stamp_ns - found.examples[-1][0] >= EXAMPLE_PERIOD_NS
+                if is_due and len(found.examples) < MOST_EXAMPLES:
+                    found.examples.append((stamp_ns, views.around(fate.range_m, fate.azimuth_rad)))
+
+    def _fan_of(self, frame: SonarFrames) -> Fan:
+        if self._fan is None or not (
+            self._fan[0].ranges_m is frame.ranges_m and self._fan[0].azimuths_rad is frame.azimuths_rad
+        ):
+            extent_m = float(frame.ranges_m.max() - frame.ranges_m.min())
+            self._fan = frame, Fan.of(frame.ranges_m, frame.azimuths_rad, round(extent_m / HALF_M * SIDE_PIXELS / 2))
+        return self._fan[1]
+
+
+class _Views:
+    """Pictures of places in one frame, drawn when the first is asked for."""
+
+    def __init__(self, frame: SonarFrames, image: SonarImage, fan: Fan) -> None:
+        self._frame, self._image, self._fan = frame, image, fan
+        self._whole: np.ndarray | None = None
+
+    def around(self, range_m: float, azimuth_rad: float) -> bytes:
+        """JPEG of a square about a place."""
+        if self._whole is None:
+            self._whole = draw_fan(decibels(self._frame.intensity[0], self._image), self._fan, None)
+        column, row = self._fan.pixel(range_m, azimuth_rad)
+        half = round(HALF_M * self._fan.pixels_per_m)
+        padded = cv2.copyMakeBorder(self._whole, half, half, half, half, cv2.BORDER_CONSTANT)
+        height, width = self._whole.shape[:2]
+        column, row = int(np.clip(column, 0, width - 1)), int(np.clip(row, 0, height - 1))
+        square = padded[row : row + 2 * half, column : column + 2 * half]
+        return as_jpeg(np.asarray(cv2.resize(square, (SIDE_PIXELS, SIDE_PIXELS)), np.uint8))

@@ -1,0 +1,53 @@
+"""Page of ``recognise --report``: each track with its picture, its probabilities and the reasons of its fate."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sonar_graph.files import replacing
+from sonar_graph.recognition import Recognition, TrackStories, TrackStory
+from sonar_graph.report.rendering import render
+from sonar_graph.sonar import REPORTED
+
+MOST_TRACKS = 400
+"""Tracks with a picture; of more those with the most frames."""
+LEAST_SHOWN = 0.005
+"""Probability below which an identity is not listed."""
+NONE = "none of them"
+
+
+def write_track_page(
+    path: Path, name: str, recognition: Recognition, stories: TrackStories, identities: Sequence[str], start_ns: int
+) -> None:
+    """Write the page, one file with all pictures in it; ``identities`` are names of the designs in their order."""
+    longest = sorted(stories.tracks.values(), key=lambda story: -story.frames)[:MOST_TRACKS]
+    shown = sorted(longest, key=lambda story: (REPORTED not in story.outcomes, story.first_ns))
+    content: dict[str, Any] = {
+        "kind": "recognition",
+        "name": name,
+        "names": [f"{len(stories.tracks)} tracks"],
+        "recognition": recognition,
+        "tracks": [_row(story, [*identities, NONE], start_ns) for story in shown],
+        "left_out": len(stories.tracks) - len(shown),
+        "rejected": sorted(stories.rejected.items(), key=lambda item: -item[1].count),
+        "start_ns": start_ns,
+        "lines": recognition.naming(),
+    }
+    with replacing(path) as partial:
+        partial.write_text(render("tracks.html", content), "utf-8")
+
+
+def _row(story: TrackStory, names: Sequence[str], start_ns: int) -> dict[str, Any]:
+    """Values of one track, by the names that the template uses."""
+    order = np.argsort(-story.beliefs).tolist()
+    return {
+        "number": story.number,
+        "jpeg": story.jpeg,
+        "from_s": (story.first_ns - start_ns) * 1e-9,
+        "to_s": (story.last_ns - start_ns) * 1e-9,
+        "frames": story.frames,
+        "beliefs": [(names[k], float(story.beliefs[k])) for k in order if story.beliefs[k] >= LEAST_SHOWN],
+        "outcomes": story.outcomes.most_common(),
+    }
