@@ -52,7 +52,7 @@ class LabelledFits:
     """Fits of designs to patches whose class is known."""
 
     evidence: Floats
-    """For each design, in the columns of `EVIDENCE`, shape (n, ids, 8)."""
+    """For each design, in the columns of `EVIDENCE`, shape (n, ids, 9)."""
     visible: Floats
     """Share of the template in view, shape (n,)."""
     label: Ints

@@ -53,7 +53,7 @@ class DesignFit:
     """Fit of each design to a patch."""
 
     evidence: Floats
-    """What speaks for each design, in the columns of `sonar_graph.sonar.figures.EVIDENCE`, shape (designs, 8)."""
+    """What speaks for each design, in the columns of `sonar_graph.sonar.figures.EVIDENCE`, shape (designs, 9)."""
     visible: float
     """Share of the cells in view at the best fit of all."""
     heading_rad: Floats

@@ -127,7 +127,7 @@ class Confusion(Section):
         return np.array(self.matrix)
 
     def log_odds(self, evidence: Floats) -> Floats:
-        """Log odds of each design against none of them, shape (..., designs), from evidence (..., designs, 8)."""
+        """Log odds of each design against none of them, shape (..., designs), from evidence (..., designs, 9)."""
         return np.asarray(evidence @ np.array(self.weights))
 
     def range_azimuth_cov(self, visible: float) -> Floats:

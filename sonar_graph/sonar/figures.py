@@ -25,10 +25,10 @@ from sonar_graph.measurements import Floats, Ints
 from sonar_graph.numerics import compiled
 from sonar_graph.sonar.templates import Floats32, Patch, Templates, drawn, material_radius_m
 
-EVIDENCE = ("prior", "outline", "figure", "contrast", "beyond", "floor", "behind", "plate")
+EVIDENCE = ("prior", "outline", "figure", "contrast", "beyond", "floor", "behind", "plate", "bare")
 """prior: 1; outline: ln R(otherwise) / R(design); figure: the same without S and D; contrast: ln beta / sigma; beyond:
 ln mean square of what is brighter than the design says, next to the figure; floor: ln mean square of what is darker,
-farther out; behind: level next to the figure on its far side, dB; plate: root of ln R(without D) / R(design)."""
+farther out; behind: level next to the figure on its far side, dB; plate: root of ln R(without D) / R(design); bare: 1 for a design without dark parts, which no plate can speak for."""
 STRETCHES = (
     *((1.0, 1.0), (0.78, 0.78), (0.87, 0.87), (0.94, 0.94), (1.07, 1.07), (1.15, 1.15), (1.27, 1.27)),
     *((1.2, 0.83), (0.83, 1.2)),
@@ -93,7 +93,7 @@ class Figures:
             )
 
     def evidence(self, patch: Patch, template: int, first: tuple[int, int]) -> Floats | None:
-        """`EVIDENCE` of a template on the part of a patch that begins at this cell, shape (8,).
+        """`EVIDENCE` of a template on the part of a patch that begins at this cell, shape (9,).
 
         None where too little of it is in view.
         """
@@ -168,7 +168,7 @@ def _evidence(
 ) -> Floats:  # fmt: skip
     """`EVIDENCE` from products of columns with each other and with levels, which have the mean 0."""
     dark, first, figures = 1, 2, (len(products) - 2) // 2
-    found, solution = np.empty(8), np.zeros(4)
+    found, solution = np.empty(9), np.zeros(4)
     # the design: with its dark parts where they are dark, with and without a shadow
     plain = residual(gram, products, total, np.array([0, first]), solution)
     floor, beta, delta = solution[0], solution[1], 0.0
@@ -211,6 +211,7 @@ def _evidence(
     found[5] = math.log((far / far_cells if far_cells > 8 else mean_square / 3) + LEAST_DB2)
     found[6] = back / back_cells if back_cells > 5 else 0.0
     found[7] = math.sqrt(max(math.log(shaded / both), 0.0))
+    found[8] = 0.0 if has_dark else 1.0
     return found
 
 

@@ -121,7 +121,7 @@ def test_news_follow_from_the_autocorrelation_of_a_triangle():
 
 
 CONFUSION = Confusion(
-    ids=(1, 2), matrix=((0.9, 0.05, 0.05), (0.05, 0.9, 0.05), (0.05, 0.05, 0.9)), weights=(0.0,) * 8, looks=2.0,
+    ids=(1, 2), matrix=((0.9, 0.05, 0.05), (0.05, 0.9, 0.05), (0.05, 0.05, 0.9)), weights=(0.0,) * 9, looks=2.0,
     range_sigma_m=0.01, azimuth_sigma_rad=0.003,
 )  # fmt: skip
 LOOKS_LIKE_1 = np.array([[6.0, -3.0, 0.0]])

@@ -27,13 +27,13 @@ ROWS = ((0.8, 0.1, 0.1), (0.2, 0.7, 0.1), (0.5, 0.1, 0.4))
 
 def model(rows: tuple[tuple[float, ...], ...] = ROWS, designs: Sequence[LandmarkDesign] = ()) -> Confusion:
     return Confusion(
-        ids=tuple(range(9, 8 + len(rows))), matrix=rows, designs=tuple(map(mark_of, designs)), weights=tuple(range(8)),
+        ids=tuple(range(9, 8 + len(rows))), matrix=rows, designs=tuple(map(mark_of, designs)), weights=tuple(range(9)),
         looks=2.0, range_sigma_m=0.01, azimuth_sigma_rad=0.002,
     )  # fmt: skip
 
 
 def test_log_odds_are_weighted_evidence_and_scores_the_posterior_of_one_look():
-    evidence = np.eye(8)[[2, 5]]
+    evidence = np.eye(9)[[2, 5]]
     np.testing.assert_allclose(model().log_odds(evidence), [2, 5])
     scores = soft_scores(np.array([[3.0, -6.0, 0.0]]), 2.0)[0]
     np.testing.assert_allclose(scores, np.exp([1, -2, 0]) / np.exp([1, -2, 0]).sum())
@@ -65,7 +65,7 @@ def test_what_was_never_confused_in_the_shipped_model_is_bounded_by_its_tracks()
         ({"matrix": [[0.9, 0.1, 0.0], *ROWS[1:]]}, "an entry is 0"),
         ({"designs": [{"name": "ring", "digest": ""}]}, "expected one for each of 2 ids, not 1"),
         ({"looks": -1.0}, "looks"),
-        ({"weights": [1.0, 2.0]}, "weights: expected 8, for prior, outline"),
+        ({"weights": [1.0, 2.0]}, "weights: expected 9, for prior, outline"),
         ({"sharpness": 17.0, "threshold": 0.8}, "an earlier version .* measure it again"),
         (None, "not JSON"),
     ],
