@@ -28,7 +28,8 @@ from sonar_graph.sonar.templates import Floats32, Patch, Templates, drawn, mater
 EVIDENCE = ("prior", "outline", "figure", "contrast", "beyond", "floor", "behind", "plate", "bare")
 """prior: 1; outline: ln R(otherwise) / R(design); figure: the same without S and D; contrast: ln beta / sigma; beyond:
 ln mean square of what is brighter than the design says, next to the figure; floor: ln mean square of what is darker,
-farther out; behind: level next to the figure on its far side, dB; plate: root of ln R(without D) / R(design); bare: 1 for a design without dark parts, which no plate can speak for."""
+farther out; behind: level next to the figure on its far side, dB; plate: root of ln R(without D) / R(design); bare: 1
+for a design without dark parts, which no plate can speak for."""
 STRETCHES = (
     *((1.0, 1.0), (0.78, 0.78), (0.87, 0.87), (0.94, 0.94), (1.07, 1.07), (1.15, 1.15), (1.27, 1.27)),
     *((1.2, 0.83), (0.83, 1.2)),
