@@ -182,9 +182,7 @@ def outcome(path: Path) -> Outcome:
     """Compare estimators on a log."""
     try:
         with patch("time.perf_counter", time.process_time):  # other processes do not count
-            comparison = compare_log(
-                path, path.with_suffix(""), ESTIMATORS, ReadingOptions(), RecogniserOptions(), 2.0, None
-            )
+            comparison = compare_log(path, ESTIMATORS, {}, ReadingOptions(), RecogniserOptions(), 2.0)
     except SonarGraphError as error:
         return Outcome(str(error), {}, {}, {}, str(error))
     console = Console(file=StringIO(), width=10_000)
