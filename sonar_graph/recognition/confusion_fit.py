@@ -23,7 +23,10 @@ from sonar_graph.measurements import Floats, Ints
 from sonar_graph.recognition.session import RecognitionSession, no_images
 from sonar_graph.sequence import Sequence as Run
 from sonar_graph.sonar import (
+    EVIDENCE,
+    SHIPPED,
     Confusion,
+    IdentityParams,
     ObjectSighting,
     Recogniser,
     RecogniserParams,
@@ -32,9 +35,6 @@ from sonar_graph.sonar import (
     read_confusion,
     soft_scores,
 )
-from sonar_graph.sonar.bayes import IdentityParams
-from sonar_graph.sonar.confusion import SHIPPED
-from sonar_graph.sonar.figures import EVIDENCE
 
 SAME_M, APART_M = 0.08, 0.40
 NO_LABEL = -2

@@ -3,7 +3,7 @@
 The image is sampled on a square grid of the floor, where foreshortening and the shape of the fan drop out; its x axis
 points away from the sonar, along the line of sight. Designs are templates on the same grid
 (`sonar_graph.sonar.templates`), and the correlation with them finds place and heading. What speaks for a design there,
-against anything else, is `sonar_graph.sonar.figures`. Derivation: docs/theory/recognition.md.
+against anything else, is `sonar_graph.sonar.evidence`. Derivation: docs/theory/recognition.md.
 """
 
 import math
@@ -20,7 +20,7 @@ from sonar_graph.images import SonarFrames
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.numerics import compiled
 from sonar_graph.sonar.confusion import Confusion
-from sonar_graph.sonar.figures import Figures
+from sonar_graph.sonar.evidence import Figures
 from sonar_graph.sonar.geometry import FloorView
 from sonar_graph.sonar.regions import Candidates
 from sonar_graph.sonar.templates import Floats32, Patch, PolarGrid, Templates
@@ -53,7 +53,7 @@ class DesignFit:
     """Fit of each design to a patch."""
 
     evidence: Floats
-    """What speaks for each design, in the columns of `sonar_graph.sonar.figures.EVIDENCE`, shape (designs, 9)."""
+    """What speaks for each design, in the columns of `sonar_graph.sonar.evidence.EVIDENCE`, shape (designs, 9)."""
     visible: float
     """Share of the cells in view at the best fit of all."""
     heading_rad: Floats

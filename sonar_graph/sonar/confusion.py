@@ -1,7 +1,7 @@
 """Measured model of recognition: how much each piece of evidence counts, and how often landmarks look like which.
 
 Classes and features are the designs in their order, last "none". With phi_k what speaks for design k in a frame
-(`sonar_graph.sonar.figures.EVIDENCE`) and w the weights, which all designs share::
+(`sonar_graph.sonar.evidence.EVIDENCE`) and w the weights, which all designs share::
 
     l_k = w . phi_k        l_none = 0        log odds of a track that always looks like this
 
@@ -30,7 +30,7 @@ from sonar_graph.errors import CalibrationError
 from sonar_graph.files import text_of
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.settings import faults_in
-from sonar_graph.sonar.figures import EVIDENCE
+from sonar_graph.sonar.evidence import EVIDENCE
 
 SHIPPED = Path(__file__).with_name("default_confusion.json")
 """The model of the designs that ship."""

@@ -15,7 +15,7 @@ from sonar_graph.recognition import confusion_fit
 from sonar_graph.sonar.appearance import DesignFit, ObjectSighting
 from sonar_graph.sonar.bayes import IdentityParams, bounded_evidence
 from sonar_graph.sonar.confusion import Confusion, confusion_for, soft_scores
-from sonar_graph.sonar.figures import EVIDENCE
+from sonar_graph.sonar.evidence import EVIDENCE
 from sonar_graph.sonar.recogniser import Recogniser, RecogniserParams
 
 IDS, RANGE_M, AZIMUTH_RAD = np.array([5, 3]), np.array([2.0, 1.5]), np.array([0.1, -0.2])

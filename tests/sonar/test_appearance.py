@@ -13,7 +13,7 @@ from sonar_graph.images import SonarFrames
 from sonar_graph.measurements import Floats
 from sonar_graph.sonar.appearance import CENTROID_SIGMA_M, Appearance, CandidateFit, DesignFit, ObjectSighting
 from sonar_graph.sonar.confusion import Confusion, confusion_for
-from sonar_graph.sonar.figures import EVIDENCE
+from sonar_graph.sonar.evidence import EVIDENCE
 from sonar_graph.sonar.geometry import FloorView
 from sonar_graph.sonar.templates import Patch, PolarGrid, Templates, material_radius_m
 
