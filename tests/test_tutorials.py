@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from sonar_graph.logs.adapters.log_config import read_log_config
 from sonar_graph.logs.reading import read_log
+from sonar_graph.logs.vehicle_setup import PartialCalibration
+from sonar_graph.recognition.labels import read_labels
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 
 TUTORIALS = Path(__file__).parents[1] / "docs" / "tutorials"
@@ -160,6 +163,20 @@ def test_page_on_batches_has_a_suite_a_command_and_a_program_that_work(tmp_path)
     assert printed.count("no kernel ok") == 4
     for cluster in blocks(page, "python cluster"):
         compile(cluster, "cluster.py", "exec")
+
+
+def test_page_on_recordings_has_a_calibration_and_labels_that_are_read(tmp_path):
+    page = (TUTORIALS / "09_from_a_recording.md").read_text(encoding="utf-8")
+    (tmp_path / "over.toml").write_text(textwrap.dedent(re.search(r"```toml\n(.*?)```", page, re.DOTALL)[1]))
+    assert "floor.z_m" in PartialCalibration.read(tmp_path / "over.toml").fields()
+    (labels,) = blocks(page, "csv")
+    (tmp_path / "labels.csv").write_text(labels)
+    assert [label.id for label in read_labels(tmp_path / "labels.csv", Path("joined.mcap")).labels] == [1, None]
+    for words in re.findall(r"^    sonar-graph (.*)$", page, re.MULTILINE):
+        command, *more = words.split()
+        options = {option for option in more if option.startswith("--")}
+        said = output(tmp_path, "sonar-graph", command, "--help", COLUMNS="300")
+        assert all(option in said for option in options), words
 
 
 def test_every_tutorial_is_listed_and_run():
