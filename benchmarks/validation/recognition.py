@@ -1,9 +1,9 @@
 """Are landmarks recognised in sonar images, and can the posteriors and covariances be believed? On simulated basins.
 
 Every seed is a basin of its own: route, floor, where the landmarks' headings point, what else lies there. The measured
-model that ships comes from other seeds (1001 to 1016). A pass is a stretch of a second or more in which an object is
-wholly in view. A detection is accepted as estimators accept it by default: its most probable landmark has a posterior
-of at least one half. It is right when that landmark truly lies within 15 cm.
+model that ships comes from other seeds (1001 to 1004, 3001 to 3218). A pass is a stretch of a second or more in which
+an object is wholly in view. A detection is accepted when its most probable landmark has a posterior of at least one
+half; estimators ask for 0.7 by default. It is right when that landmark truly lies within 15 cm.
 
 * `passes_recognised`: share of the landmarks' passes with a right detection that is accepted;
 * `accepted_right`: share of accepted detections that are right;

@@ -2,8 +2,8 @@
 
 Short basins (200 s, one lap) that differ in contrast, in cover by sediment, in the plate, and the presets of harder
 scenes. Beside each landmark lie two unknown objects, of nine kinds in turn. Both rules see the same frames. Seeds are
-those of `recognition.py`; the measured model that ships comes from others (1001 to 1016). Nothing is fitted to these
-scenes.
+those of `recognition.py`; the measured model that ships comes from others (1001 to 1004, 3001 to 3218). Nothing is
+fitted to these scenes.
 
 * `recognised`: share of the landmarks' passes with a right detection that is accepted (posterior at least one half);
 * `natural`, `look_alikes`: share of the passes of unknown objects in which one was accepted as a landmark; stones and

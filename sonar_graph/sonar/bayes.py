@@ -87,8 +87,9 @@ class IdentityParams(Section):
 
     rule: Rule = "virtual-evidence"
     """virtual-evidence: ours, bounded; jeffrey: the 2014 paper's equations as printed, every frame counting in full."""
-    unknown_prior: float = Field(2 / 3, gt=0, lt=1)
-    """Belief in "none of them" about a new track: two unknown objects for each landmark."""
+    unknown_prior: float = Field(6 / 7, gt=0, lt=1)
+    """Belief in "none of them" about a new track: six unknown objects for each landmark. The least whole number with
+    which strangers of the calibration basins are rarely accepted (docs/theory/recognition.md)."""
     forgetting: float = Field(1e-4, ge=0, lt=1)
     """Share of a belief that returns to that of a new track, per frame; of the rule jeffrey only."""
     least_news: float = Field(0.1, ge=0, lt=1)

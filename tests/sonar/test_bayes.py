@@ -162,7 +162,7 @@ def test_a_resting_sonar_learns_nothing_and_the_papers_rule_counts_every_frame()
 
 
 def test_looks_from_new_places_add_up_and_old_places_are_no_news():
-    found = _after([(0, 0.07 * k, 0) for k in range(6)])
+    found = _after([(0, 0.07 * k, 0) for k in range(6)], unknown_prior=2 / 3)
     assert (np.diff(found) > 0).all()
     assert found[-1] > 0.9
     away_and_back = _after([(0, 0, 0), (0, 0.1, 0), (0, 0, 0), (0, 0.1, 0)])
