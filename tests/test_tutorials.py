@@ -15,6 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 from sonar_graph.logs.adapters.log_config import read_log_config
 from sonar_graph.logs.reading import read_log
 from sonar_graph.logs.vehicle_setup import PartialCalibration
+from sonar_graph.recognition.confusion_fit import LEAST_FRAMES
 from sonar_graph.recognition.labels import read_labels
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 
@@ -169,6 +170,7 @@ def test_page_on_recordings_has_a_calibration_and_labels_that_are_read(tmp_path)
     page = (TUTORIALS / "09_from_a_recording.md").read_text(encoding="utf-8")
     (tmp_path / "over.toml").write_text(textwrap.dedent(re.search(r"```toml\n(.*?)```", page, re.DOTALL)[1]))
     assert "floor.z_m" in PartialCalibration.read(tmp_path / "over.toml").fields()
+    assert f'Of every landmark and of "none of them" {LEAST_FRAMES} labelled frames are needed' in page
     (labels,) = blocks(page, "csv")
     (tmp_path / "labels.csv").write_text(labels)
     assert [label.id for label in read_labels(tmp_path / "labels.csv", Path("joined.mcap")).labels] == [1, None]

@@ -200,7 +200,7 @@ def bless(
     from sonar_graph.batch import is_reference, read_batch
 
     batch = read_batch(folder)
-    write_reference(batch, writable_json(reference, [], is_reference, overwrite=overwrite))
+    write_reference(batch, writable_json(reference, "a reference", [], is_reference, overwrite=overwrite))
     failed = sum(not run.ended for run in batch.runs)
     echo(f"Reference: {reference} ({len(batch.runs)} runs, {failed} of which did not end)")
 

@@ -44,7 +44,9 @@ def label(
     from sonar_graph.logs import no_images, read_images_alone, read_sonar_frames
     from sonar_graph.recognition import LabelDesk, Labels, LabelServer, read_labels, shown_frames
 
-    path = writable_json(output, [log], lambda content: content.keys() == {"log", "labels"}, overwrite=overwrite)
+    path = writable_json(
+        output, "labels", [log], lambda content: content.keys() == {"log", "labels"}, overwrite=overwrite
+    )
     known = DEFAULT_DESIGNS if designs is None else load_designs(designs)
     is_continued = path.exists() and path.stat().st_size and not overwrite
     labels = read_labels(path, log) if is_continued else Labels(log=spelt(log.name))

@@ -43,9 +43,9 @@ def writable_log(path: Path, *sources: Path | None, overwrite: bool = False) -> 
 
 
 def writable_json(
-    path: Path, sources: Iterable[Path], is_own: Callable[[dict[str, Any]], bool], *, overwrite: bool = False
+    path: Path, what: str, sources: Iterable[Path], is_own: Callable[[dict[str, Any]], bool], *, overwrite: bool = False
 ) -> Path:
-    """Check that a JSON file can be written, and return ``path``.
+    """Check that a JSON file of ``what`` can be written, and return ``path``.
 
     Raises `EvaluationError` when it is one of the sources, cannot be written, or has a content that is not ``is_own``.
     """
@@ -59,7 +59,7 @@ def writable_json(
             content = read_json(path)
         if not is_own(content):
             raise EvaluationError(
-                f"{path}: exists, and sonar-graph did not write it; choose another name, or give --overwrite"
+                f"{path}: exists, and holds something else than {what}; choose another name, or give --overwrite"
             )
     _require_writing_in(path.parent, path, EvaluationError)
     return path

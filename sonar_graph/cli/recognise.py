@@ -225,11 +225,13 @@ def calibrate(
     overwrite: Overwrite = False,
 ) -> None:
     """Measure how often landmarks look like which, on logs with sonar images whose truth or labels are known."""
+    from sonar_graph.recognition import LabelledLog, calibrate_by_labels, read_labels
     from sonar_graph.recognition import calibrate as measure
-    from sonar_graph.recognition import calibrate_by_labels, read_labels
 
     sources = [*logs, *(labels or [])]
-    path = writable_json(output, sources, lambda content: "ids" in content and "matrix" in content, overwrite=overwrite)
+    path = writable_json(
+        output, "a model", sources, lambda content: "ids" in content and "matrix" in content, overwrite=overwrite
+    )
     for row, log in enumerate(logs):
         if any(log.samefile(other) for other in logs[:row]):
             raise LogError(f"{log}: is named twice, and its frames would count twice; name each log once")
@@ -245,7 +247,10 @@ def calibrate(
             given = [read_labels(file, log) for log, file in zip(logs, labels, strict=True)]
             runs = [with_motion(log, reading, motion) for log in logs]
             measured = calibrate_by_labels(
-                [(log, run, own, how) for log, own, (run, how) in zip(logs, given, runs, strict=True)],
+                [
+                    LabelledLog(log, run, own, file, how)
+                    for log, file, own, (run, how) in zip(logs, labels, given, runs, strict=True)
+                ],
                 topic=topic,
                 config=reading.config,
                 designs=known,
@@ -263,11 +268,19 @@ def calibrate(
             )
     with replacing(path) as partial:
         partial.write_text(measured.model_dump_json(indent=2) + "\n", encoding="utf-8")
+    for number in range(1, len(labels or []) + 1):
+        answers().print(measured.provenance[f"labels {number}"])
     few = []
     for name in (*(f"landmark {i}" for i in measured.ids), "no landmark"):
         frames, tracks = (measured.provenance[f"{what} of {name}"] for what in ("frames", "tracks"))
         answers().print(f"  {name}: {frames} frames, {tracks} tracks")
         few += [name] if int(tracks) < FEW_TRACKS else []
+    interval = measured.report_interval()
+    answers().print(
+        f"  range sigma {1e3 * measured.range_sigma_m:.1f} mm, azimuth sigma {measured.azimuth_sigma_rad:.4f} rad, "
+        f"error correlation {measured.error_correlation:.2f} between frames of a track: "
+        + ("every frame is reported" if interval == 1 else f"one frame in {interval} is reported")
+    )
     if few:
         answers().print(
             f"Caution: fewer than {FEW_TRACKS} tracks of {', '.join(few)}: frames of one track are alike; "

@@ -5,7 +5,7 @@ from sonar_graph.recognition.clock_offset import ClockOffset, estimate_offset
 from sonar_graph.recognition.confusion_fit import calibrate
 from sonar_graph.recognition.image_motion import ImageMotions, MotionFrom, PlanarStep
 from sonar_graph.recognition.label_server import LabelDesk, LabelServer, shown_frames
-from sonar_graph.recognition.labels import Labels, calibrate_by_labels, read_labels
+from sonar_graph.recognition.labels import LabelledLog, Labels, calibrate_by_labels, read_labels
 from sonar_graph.recognition.recognition_record import (
     PICTURE_FOLDER, RECOGNITION, SURE, DrawnFrame, Recognition, read_recognition, write_recognition,
 )
@@ -15,8 +15,9 @@ from sonar_graph.recognition.session import (
 from sonar_graph.recognition.track_stories import TrackStories, TrackStory
 
 __all__ = [
-    "ClockOffset", "DrawnFrame", "ImageMotions", "LabelDesk", "LabelServer", "Labels", "LandmarkRecogniser",
-    "MotionFrom", "NO_FLOOR", "PICTURE_FOLDER", "PlanarStep", "RECOGNITION", "Recognition", "SURE", "TrackStories",
-    "TrackStory", "calibrate", "calibrate_by_labels", "estimate_offset", "one_by_one", "read_labels",
-    "read_recognition", "recognise", "recognise_images", "shown_frames", "with_detections", "write_recognition",
+    "ClockOffset", "DrawnFrame", "ImageMotions", "LabelDesk", "LabelServer", "LabelledLog", "Labels",
+    "LandmarkRecogniser", "MotionFrom", "NO_FLOOR", "PICTURE_FOLDER", "PlanarStep", "RECOGNITION", "Recognition",
+    "SURE", "TrackStories", "TrackStory", "calibrate", "calibrate_by_labels", "estimate_offset", "one_by_one",
+    "read_labels", "read_recognition", "recognise", "recognise_images", "shown_frames", "with_detections",
+    "write_recognition",
 ]

@@ -18,7 +18,7 @@ exceeds their own.
 
 import csv
 import json
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -47,6 +47,11 @@ NEAR_M = 0.2
 """Distance of a candidate up to which a label is of it."""
 CLICK_SIGMA_M = 0.01
 """Standard deviation of a label along each axis, where labels do not tell it."""
+MOST_ROWS = 8
+"""Rows of labels that a message lists."""
+OUTSIDE, NO_FRAME, UNUSED = "outside of the image", "no such frame", "of a frame that was not used"
+NO_TRACK, CONTRADICTED = "no track there", "on a track that has other labels too"
+"""Why labels tell nothing."""
 NOWHERE = np.array([-1]), np.array([1e9]), np.array([0.0])
 """True landmarks around what is none: one that is far away."""
 
@@ -86,7 +91,7 @@ def read_labels(path: Path, log: Path) -> Labels:
         When the file cannot be read, is neither, has a field that does not fit, or is of another log.
     """
     try:
-        text = text_of(path)
+        text = text_of(path, "utf-8-sig")  # spreadsheets begin their CSV with a byte-order mark
         content = _from_csv(text, log) if path.suffix.lower() == ".csv" else json.loads(text)
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be read: {error.strerror}") from error
@@ -132,6 +137,18 @@ class LabelledTrack:
         return np.asarray(np.median(self.seen, axis=0))
 
 
+@dataclass(frozen=True)
+class LabelledLog:
+    """A log with labels, and where its motion is from."""
+
+    path: Path
+    run: Run | ImagesAlone
+    labels: Labels
+    file: Path
+    """Of the labels, for messages."""
+    motion: MotionFrom = "navigation"
+
+
 def trusted_share(tracks: Sequence[LabelledTrack]) -> float:
     """Share of the distance of labels from sightings that is not the labels' own error, pooled over tracks."""
     several = [track for track in tracks if len(track.labelled) > 1]
@@ -145,7 +162,7 @@ def trusted_share(tracks: Sequence[LabelledTrack]) -> float:
 
 
 def calibrate_by_labels(
-    logs: Sequence[tuple[Path, Run | ImagesAlone, Labels, MotionFrom]],
+    logs: Sequence[LabelledLog],
     *,
     topic: str | None = None,
     config: LogConfig | None = None,
@@ -153,7 +170,7 @@ def calibrate_by_labels(
     params: RecogniserParams | None = None,
     salvage: bool = False,
 ) -> Confusion:
-    """Measure the model of recognition on logs with labels, each with where its motion is from.
+    """Measure the model of recognition on logs with labels; its provenance says of each file what labels met.
 
     The other parameters are those of `calibrate`.
 
@@ -166,21 +183,21 @@ def calibrate_by_labels(
     """
     designs = tuple(designs or DEFAULT_DESIGNS)
     gathered = LabelledSightings(tuple(design.id for design in designs))
-    given = met = 0
-    for log, (path, run, labels, motion) in enumerate(logs):
-        if unknown := {label.id for label in labels.labels} - {None, *gathered.ids}:
+    provenance = {"logs": spelt(", ".join(one.path.name for one in logs)), "what they are": "labels"}
+    for log, one in enumerate(logs, 1):
+        if unknown := {label.id for label in one.labels.labels if label.id is not None} - set(gathered.ids):
             raise CalibrationError(
-                f"{path}: its labels name landmark {', '.join(map(str, sorted(map(int, filter(None, unknown)))))}, the "
-                f"designs are {', '.join(map(str, gathered.ids))}; give the designs of the labels with --designs"
+                f"{one.file}: its labels name landmark {', '.join(map(str, sorted(unknown)))}, the designs are "
+                f"{', '.join(map(str, gathered.ids))}; give the designs of the labels with --designs"
             )
-        recogniser = Recogniser(run.calibration, designs, params)
-        session = RecognitionSession(run, recogniser=recogniser, pictures=False, motion=motion)
-        tracks, frames = _labelled_tracks(
-            session, recogniser, labels, read_sonar_frames(path, topic, config, salvage=salvage)
-        )
-        given, met = given + len(labels.labels), met + sum(len(track.labelled) for track in tracks.values())
-        if labels.labels and not frames:
-            raise CalibrationError(f"{path}: no frame has the stamp of any label; are these labels of another log?")
+        recogniser = Recogniser(one.run.calibration, designs, params)
+        tracks, unmet = _labelled_tracks(one, recogniser, read_sonar_frames(one.path, topic, config, salvage=salvage))
+        given = len(one.labels.labels)
+        if given and len(unmet[NO_FRAME]) == given:
+            raise CalibrationError(
+                f"{one.file}: no frame of {one.path.name} has the stamp of any label; are these labels of another log?"
+            )
+        provenance[f"labels {log}"] = f"{spelt(one.file.name)}: {what_labels_met(given, unmet)}"
         # those that nobody labelled, and those of two landmarks, tell nothing
         sure = {number: track for number, track in tracks.items() if len(track.ids) == 1}
         known = [track for track in sure.values() if track.ids != {None}]
@@ -191,28 +208,42 @@ def calibrate_by_labels(
             for world_T_sonar, sighting, news in track.sightings:
                 truth = NOWHERE if landmark is None else _seen_from(world_T_sonar, place, landmark)
                 gathered.add(sighting, (log, number), news, *truth)
-    names = spelt(", ".join(path.name for path, *_ in logs))
-    provenance = {"logs": names, "what they are": f"labels: {given}, of which {met} met a track"}
     try:
         return estimate_confusion(gathered.fits(), gathered.ids, provenance, designs)
     except CalibrationError as error:
         raise CalibrationError(
-            f"{met} of {given} labels met a track of the recogniser; {error}, or label more with `sonar-graph label`"
+            f"{'; '.join(provenance[f'labels {log}'] for log in range(1, len(logs) + 1))}; {error}, or label more with "
+            "`sonar-graph label`"
         ) from error
 
 
+def what_labels_met(given: int, unmet: dict[str, list[int]]) -> str:
+    """How many of the labels met a track, and the rows (from 1) of those that tell nothing, by reason."""
+    missed = sum(len(rows) for reason, rows in unmet.items() if reason != CONTRADICTED)
+    said = [f"{given - missed} of {given} labels met a track of the recogniser"]
+    for reason, rows in sorted(unmet.items(), key=lambda item: min(item[1], default=0)):
+        if rows:
+            listed = ", ".join(map(str, sorted(rows)[:MOST_ROWS]))
+            more = f" and {len(rows) - MOST_ROWS} more" if len(rows) > MOST_ROWS else ""
+            said.append(f"row{'s' if len(rows) > 1 else ''} {listed}{more}: {reason}")
+    return "; ".join(said)
+
+
 def _labelled_tracks(
-    session: RecognitionSession, recogniser: Recogniser, labels: Labels, blocks: Iterable[SonarFrames]
-) -> tuple[dict[int, LabelledTrack], int]:
-    """Tracks by number, with the labels that they met, and the number of frames that have a label."""
+    log: LabelledLog, recogniser: Recogniser, blocks: Iterable[SonarFrames]
+) -> tuple[dict[int, LabelledTrack], dict[str, list[int]]]:
+    """Tracks by number, with the labels that they met, and the rows (from 1) of labels that tell nothing, by reason."""
+    used: deque[SonarFrames] = deque(maxlen=1)
+    session = RecognitionSession(log.run, recogniser=recogniser, pictures=False, motion=log.motion, seen=used.append)
     tracks: dict[int, LabelledTrack] = defaultdict(LabelledTrack)
-    by_stamp: dict[int, list[Label]] = defaultdict(list)
-    for label in labels.labels:
-        by_stamp[label.stamp_ns].append(label)
-    frames = 0
+    unmet: dict[str, list[int]] = defaultdict(list)
+    row_of: dict[int, list[int]] = defaultdict(list)
+    by_stamp: dict[int, list[tuple[int, Label]]] = defaultdict(list)
+    for row, label in enumerate(log.labels.labels, 1):
+        by_stamp[label.stamp_ns].append((row, label))
     for stamp_ns in session.run(blocks):
-        frames += stamp_ns in by_stamp
         if recogniser.stamp_ns != stamp_ns:
+            unmet[UNUSED] += [row for row, _ in by_stamp.pop(stamp_ns, [])]
             continue
         seen: dict[int, ObjectSighting] = {}
         rows = zip(recogniser.track_ids.tolist(), recogniser.sightings, recogniser.news.tolist(), strict=True)
@@ -222,13 +253,27 @@ def _labelled_tracks(
             seen[number] = sighting
             tracks[number].sightings.append((session.start_T_sonar, sighting, news))
             tracks[number].seen.append(place_of(sighting.range_m, sighting.azimuth_rad, session))
-        for label in by_stamp.pop(stamp_ns, []):
+        for row, label in by_stamp.pop(stamp_ns, []):
             away = {number: _distance(sighting, label) for number, sighting in seen.items()}
             nearest = min(away, key=lambda number: away[number], default=None)
             if nearest is not None and away[nearest] <= NEAR_M:
                 tracks[nearest].ids.add(label.id)
                 tracks[nearest].labelled.append(place_of(label.range_m, label.azimuth_rad, session))
-    return tracks, frames
+                row_of[nearest].append(row)
+            else:
+                unmet[NO_TRACK if used and _is_within(used[0], label) else OUTSIDE].append(row)
+    unmet[NO_FRAME] = [row for labels in by_stamp.values() for row, _ in labels]
+    unmet[CONTRADICTED] = [row for number, rows in row_of.items() if len(tracks[number].ids) > 1 for row in rows]
+    return tracks, unmet
+
+
+def _is_within(frame: SonarFrames, label: Label) -> bool:
+    """True for a place in the image, up to half a bin and half a beam beyond the outer middles."""
+    half_bin, half_beam = (np.abs(np.diff(axis)).max(initial=0) / 2 for axis in (frame.ranges_m, frame.azimuths_rad))
+    return bool(
+        frame.ranges_m.min() - half_bin <= label.range_m <= frame.ranges_m.max() + half_bin
+        and frame.azimuths_rad.min() - half_beam <= label.azimuth_rad <= frame.azimuths_rad.max() + half_beam
+    )
 
 
 def _distance(sighting: ObjectSighting, label: Label) -> float:

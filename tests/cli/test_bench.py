@@ -135,9 +135,11 @@ def test_no_more_than_ten_runs_that_stand_out_are_printed():
 def test_a_json_file_of_others_is_replaced_only_when_asked_for(content, basin, run, tmp_path, capsys):
     mine, folder = tmp_path / "mine.json", batch(tmp_path / "batch")
     mine.write_text(content)
-    for command in (("calibrate", basin, "-o", mine), ("bench", "bless", folder, mine)):
+    bless, calibrate = ("bench", "bless", folder, mine), ("calibrate", basin, "-o", mine)
+    for command, what in ((calibrate, "a model"), (bless, "a reference")):
         assert run(*command) == 2
-        assert "did not write it; choose another name, or give --overwrite" in capsys.readouterr().err
+        said = f"holds something else than {what}; choose another name, or give --overwrite"
+        assert said in capsys.readouterr().err
     assert mine.read_text() == content
     assert run("bench", "bless", folder, mine, "--overwrite") == run("bench", "bless", folder, mine) == 0
 

@@ -128,6 +128,13 @@ def test_a_model_that_calibrate_wrote_is_used(lane_log, run, tmp_path, monkeypat
     assert re.search(r"^  landmark 1: \d+ frames, 1 tracks?$", said, re.MULTILINE)
     assert re.search(r"^Caution: fewer than 10 tracks of landmark 1, .*more logs", said, re.MULTILINE)
     model = read_confusion(tmp_path / "model.json")
+    sigmas = f"  range sigma {1e3 * model.range_sigma_m:.1f} mm, azimuth sigma {model.azimuth_sigma_rad:.4f} rad, "
+    interval = model.report_interval()
+    every = "every frame is reported" if interval == 1 else f"one frame in {interval} is reported"
+    of_errors = f"error correlation {model.error_correlation:.2f} between frames of a track: {every}\n"
+    assert f"{sigmas}{of_errors}" in said
+    assert run("label", lane_log, "-o", tmp_path / "model.json") == 2
+    assert "model.json: exists, and holds something else than labels; choose" in capsys.readouterr().err
     assert model.provenance["logs"] == "lane.mcap"
     assert run("recognise", lane_log, "-o", tmp_path / "out.mcap", "--model", tmp_path / "model.json") == 0
     found = read_log(tmp_path / "out.mcap").detections
@@ -139,7 +146,7 @@ def test_labels_take_the_place_of_a_truth_and_mistakes_with_them_are_named(lane,
     stamp_ns = int(lane.frames.stamps_ns[40])
     given.write_text(json.dumps({"log": "lane.mcap", "labels": []}))
     for words, said in (
-        (("--labels", given), "0 of 0 labels met a track of the recogniser; too few labelled frames"),
+        (("--labels", given), "labels.json: 0 of 0 labels met a track of the recogniser; too few labelled frames"),
         (("--labels", given, "--labels", given), "1 logs and 2 files for --labels; give one for each log"),
         (("--motion", "images"), "--motion is for --labels"),
     ):
@@ -148,7 +155,7 @@ def test_labels_take_the_place_of_a_truth_and_mistakes_with_them_are_named(lane,
     label = {"stamp_ns": stamp_ns, "range_m": 1.9, "azimuth_rad": 0.0, "id": 12}
     given.write_text(json.dumps({"log": "lane.mcap", "labels": [label]}))
     assert run("calibrate", lane_log, "-o", model, "--labels", given) == 2
-    assert "lane.mcap: its labels name landmark 12, the designs are 1, 2, 3, 4" in capsys.readouterr().err
+    assert "labels.json: its labels name landmark 12, the designs are 1, 2, 3, 4" in capsys.readouterr().err
     assert run("label", lane_log, "-o", given.rename(tmp_path / "other.json").with_name("model.toml")) == 2
     assert "expected the name of a file that ends in .json" in capsys.readouterr().err
 

@@ -379,6 +379,10 @@ def test_half_a_chunk_gives_its_whole_messages(path: Path, compression: Compress
 OTHER_FILES = {
     b"#ROSBAG V2.0\n": r"a ROS 1 bag; `sonar-graph convert rosbag .*log\.bag -o log\.mcap`",
     b"SQLite format 3\0": "a ROS 2 bag of the sqlite3 kind; `sonar-graph convert rosbag",
+    b"DDF\x05" + bytes(60): r"an ARIS' recording; `sonar-graph convert aris .*log\.bag -o log\.mcap` makes one",
+    b"DDF\x03" + bytes(60): "a DIDSON's recording; `sonar-graph convert didson ",
+    b"SO\x01\0\0\0\x23\0": "an Oculus' recording; `sonar-graph convert oculus ",
+    b"DDF SO": "a text that begins with 'DDF SO'",
     b"": "empty: copy it again",
     bytes(1000): "zeros: copy it again",
     b'{"a": 1}\nb': r"""a text that begins with '\{"a": 1\}'""",
@@ -394,6 +398,10 @@ def test_other_files_are_named_for_what_they_are(tmp_path: Path) -> None:
         path.write_bytes(content)
         with pytest.raises(LogError, match=rf"not an MCAP file but {kind}"):
             scan_all(path)
+    viewer = tmp_path / "dive.oculus"
+    viewer.write_bytes(b"\x44\x33\x22\x11")
+    with pytest.raises(LogError, match="a file of the Oculus viewer, which is not read"):
+        scan_all(viewer)
     for path, kind in ((tmp_path, "is a folder"), (tmp_path / "none.mcap", "No such file")):
         with pytest.raises(LogError, match=kind):
             scan_all(path)

@@ -1,6 +1,8 @@
 """Files of labels, and the model measured by a few of them against that by the whole truth."""
 
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,7 +10,15 @@ import pytest
 from sonar_graph.errors import CalibrationError
 from sonar_graph.recognition import confusion_fit, labels
 from sonar_graph.recognition.confusion_fit import true_ranges_azimuths
-from sonar_graph.recognition.labels import Label, LabelledTrack, Labels, calibrate_by_labels, read_labels, trusted_share
+from sonar_graph.recognition.labels import (
+    Label,
+    LabelledLog,
+    LabelledTrack,
+    Labels,
+    calibrate_by_labels,
+    read_labels,
+    trusted_share,
+)
 
 CLICK_PIXELS_M = 0.005
 
@@ -39,25 +49,44 @@ def clicks(lane, lane_log, lane_recognition) -> Labels:
 def test_a_few_labels_measure_what_the_whole_truth_does(lane, lane_log, clicks, monkeypatch):
     monkeypatch.setattr(confusion_fit, "LEAST_FRAMES", 8)
     by_truth = confusion_fit.calibrate([(lane_log, lane.sequence)])
-    by_labels = calibrate_by_labels([(lane_log, lane.sequence, clicks, "navigation")])
+    first = clicks.labels[0]
+    frame = lane.one(0)
+    vain = [
+        first.model_copy(update={"range_m": 9.0}),
+        first.model_copy(update={"stamp_ns": 5}),
+        first.model_copy(update={"azimuth_rad": 1.5}),
+        first.model_copy(update={"range_m": float(frame.ranges_m[3])}),
+        first.model_copy(update={"range_m": float(frame.ranges_m[-1]) + 0.3}),
+    ]
+    given = Labels(log=clicks.log, labels=(*vain, *clicks.labels))
+    by_labels = calibrate_by_labels([LabelledLog(lane_log, lane.sequence, given, Path("out.csv"))])
     assert by_labels.ids == by_truth.ids
     np.testing.assert_allclose(by_labels.matrix, by_truth.matrix, atol=0.1)
     for name in ("frames of landmark 1", "frames of landmark 3", "tracks of landmark 2"):
         assert int(by_labels.provenance[name]) >= 0.8 * int(by_truth.provenance[name])
     assert by_labels.range_sigma_m < 0.02
-    assert by_labels.provenance["what they are"].startswith(f"labels: {len(clicks.labels)}, of which ")
+    said = by_labels.provenance["labels 1"]
+    assert re.match(rf"out\.csv: \d+ of {len(given.labels)} labels met a track", said)
+    assert "; rows 1, 3, 5: outside of the image" in said
+    assert "; row 2: no such frame" in said
+    assert re.search("; rows? 4[^;]*: no track there", said)
 
 
 def test_labels_of_other_frames_designs_or_too_few_are_refused(lane, lane_log, clicks):
     def refusal(*given: Label) -> str:
+        own = LabelledLog(lane_log, lane.sequence, Labels(log="lane.mcap", labels=given), Path("out.csv"), "images")
         with pytest.raises(CalibrationError) as refused:
-            calibrate_by_labels([(lane_log, lane.sequence, Labels(log="lane.mcap", labels=given), "images")])
+            calibrate_by_labels([own])
+        assert str(refused.value).startswith("out.csv: ")
         return str(refused.value)
 
     first = clicks.labels[0]
     assert "name landmark 17, the designs are 1, 2, 3, 4" in refusal(first.model_copy(update={"id": 17}))
-    assert "no frame has the stamp of any label" in refusal(first.model_copy(update={"stamp_ns": 5}))
-    assert "0 of 1 labels met a track" in refusal(first.model_copy(update={"range_m": 9.0}))
+    assert "no frame of lane.mcap has the stamp of any label" in refusal(first.model_copy(update={"stamp_ns": 5}))
+    assert "0 of 1 labels met a track of the recogniser; row 1: outside of the image; too few" in refusal(
+        first.model_copy(update={"range_m": 9.0})
+    )
+    assert "; rows 1, 2: on a track that has other labels too" in refusal(first, first.model_copy(update={"id": None}))
     assert "label more with `sonar-graph label`" in refusal(first)
 
 
@@ -69,8 +98,9 @@ def test_labels_are_read_as_they_were_written_and_from_csv(clicks, lane_log, tmp
         f"{one.stamp_ns},{one.range_m!r},{one.azimuth_rad!r},{'' if one.id is None else one.id}"
         for one in clicks.labels
     ]
-    (tmp_path / "labels.csv").write_text("\n".join(["stamp_ns,range_m,azimuth_rad,id", *rows]))
-    assert read_labels(tmp_path / "labels.csv", lane_log) == clicks
+    for encoding in ("utf-8", "utf-8-sig"):  # spreadsheets begin with a byte-order mark
+        (tmp_path / "labels.csv").write_text("\n".join(["stamp_ns,range_m,azimuth_rad,id", *rows]), encoding)
+        assert read_labels(tmp_path / "labels.csv", lane_log) == clicks
 
 
 @pytest.mark.parametrize(

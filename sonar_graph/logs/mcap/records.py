@@ -30,11 +30,17 @@ START_BYTES = 64
 
 def kind_and_advice(path: Path, start: bytes) -> str:
     """The end of "`path` is not an MCAP file but ...", from the first `START_BYTES` bytes of the file."""
-    convert = f"`sonar-graph convert rosbag {path} -o {path.with_suffix('.mcap').name}` makes one"
-    if start.startswith(b"#ROSBAG"):
-        return f"a ROS 1 bag; {convert}"
-    if start.startswith(b"SQLite format 3"):
-        return f"a ROS 2 bag of the sqlite3 kind; {convert}"
+    for kind, command, is_so in (
+        ("a ROS 1 bag", "rosbag", start.startswith(b"#ROSBAG")),
+        ("a ROS 2 bag of the sqlite3 kind", "rosbag", start.startswith(b"SQLite format 3")),
+        ("an ARIS' recording", "aris", start.startswith(b"DDF\x05")),
+        ("a DIDSON's recording", "didson", start.startswith(b"DDF") and start[3:4] < b" "),
+        ("an Oculus' recording", "oculus", start.startswith(b"SO") and b"\0" in start),
+    ):
+        if is_so:
+            return f"{kind}; `sonar-graph convert {command} {path} -o {path.with_suffix('.mcap').name}` makes one"
+    if path.suffix.lower() == ".oculus":
+        return "a file of the Oculus viewer, which is not read; `sonar-graph convert oculus` reads network messages"
     return _unknown_kind(start, "logs are .mcap files, and ROS bags become one by `sonar-graph convert rosbag`")
 
 
