@@ -149,7 +149,7 @@ def recognise(
     the images.
     """
     from sonar_graph.logs import DETECTIONS, METADATA, detection_messages, no_images, with_notes, write_amended
-    from sonar_graph.recognition import TrackStories
+    from sonar_graph.recognition import SEE_TRACKS, TrackStories
     from sonar_graph.report.tracks import write_track_page
     from sonar_graph.sonar import Recogniser
 
@@ -182,7 +182,8 @@ def recognise(
     for outcome, count in found.outcomes.most_common():
         out.print(f"  {count:6d}  {outcome}")
     for line in found.naming(getattr(sequence, "true_landmarks", None)):
-        out.print(line)
+        if page is None or line != SEE_TRACKS:
+            out.print(line)
     if motion != "navigation":
         for line in without_navigation(found):
             echo(f"Without navigation: {line}")

@@ -7,7 +7,7 @@ from sonar_graph.recognition.image_motion import ImageMotions, MotionFrom, Plana
 from sonar_graph.recognition.label_server import LabelDesk, LabelServer, shown_frames
 from sonar_graph.recognition.labels import LabelledLog, Labels, calibrate_by_labels, read_labels
 from sonar_graph.recognition.recognition_record import (
-    PICTURE_FOLDER, RECOGNITION, SURE, DrawnFrame, Recognition, read_recognition, write_recognition,
+    PICTURE_FOLDER, RECOGNITION, SEE_TRACKS, SURE, DrawnFrame, Recognition, read_recognition, write_recognition,
 )
 from sonar_graph.recognition.session import (
     NO_FLOOR, LandmarkRecogniser, one_by_one, recognise, recognise_images, with_detections,
@@ -17,7 +17,7 @@ from sonar_graph.recognition.track_stories import TrackStories, TrackStory
 __all__ = [
     "ClockOffset", "DrawnFrame", "ImageMotions", "LabelDesk", "LabelServer", "LabelledLog", "Labels",
     "LandmarkRecogniser", "MotionFrom", "NO_FLOOR", "PICTURE_FOLDER", "PlanarStep", "RECOGNITION", "Recognition",
-    "SURE", "TrackStories", "TrackStory", "calibrate", "calibrate_by_labels", "estimate_offset", "one_by_one",
-    "read_labels", "read_recognition", "recognise", "recognise_images", "shown_frames", "with_detections",
-    "write_recognition",
+    "SEE_TRACKS", "SURE", "TrackStories", "TrackStory", "calibrate", "calibrate_by_labels", "estimate_offset",
+    "one_by_one", "read_labels", "read_recognition", "recognise", "recognise_images", "shown_frames",
+    "with_detections", "write_recognition",
 ]

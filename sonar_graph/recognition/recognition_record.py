@@ -26,6 +26,8 @@ LEAST_NAMED = 0.5
 
 FEWEST_TRACKS, MOSTLY = 10, 0.9
 """Number of reported tracks, and share of them without a landmark, from which images are doubted."""
+SEE_TRACKS = "`sonar-graph recognise --report PAGE.html` shows the tracks"
+"""Line after that doubt; not for that page itself."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +86,7 @@ class Recognition:
                 listed = ", ".join(map(str, unknown))
                 lines.append(f"Warning: the log has landmarks {listed}, of which there is no design; give --designs")
         if (line := self.unlike_the_model()) is not None:
-            lines.append(line)
+            lines += [line, SEE_TRACKS]
         return lines
 
     def unlike_the_model(self) -> str | None:
@@ -98,8 +100,7 @@ class Recognition:
             return None
         return (
             f"Warning: {count} of {len(last)} tracks are of no landmark: the images may be unlike those that the model "
-            "was measured on; `sonar-graph label` and `calibrate --labels` measure it on these, and `recognise "
-            "--report PAGE.html` shows the tracks"
+            "was measured on; `sonar-graph label` and `calibrate --labels` measure it on these"
         )
 
     def entry(self) -> dict[str, Any]:

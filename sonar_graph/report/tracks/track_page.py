@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from sonar_graph.files import replacing
-from sonar_graph.recognition import Recognition, TrackStories, TrackStory
+from sonar_graph.recognition import SEE_TRACKS, Recognition, TrackStories, TrackStory
 from sonar_graph.report.rendering import render
 from sonar_graph.sonar import REPORTED
 
@@ -27,16 +27,22 @@ def write_track_page(
     content: dict[str, Any] = {
         "kind": "recognition",
         "name": name,
-        "names": [f"{len(stories.tracks)} tracks"],
+        "extent": f"{_number_of(recognition.frames, 'frame')}, {_number_of(len(stories.tracks), 'track')}",
+        "names": [_number_of(len(stories.tracks), "track")],
         "recognition": recognition,
         "tracks": [_row(story, [*identities, NONE], start_ns) for story in shown],
         "left_out": len(stories.tracks) - len(shown),
         "rejected": sorted(stories.rejected.items(), key=lambda item: -item[1].count),
         "start_ns": start_ns,
-        "lines": recognition.naming(),
+        "lines": [line for line in recognition.naming() if line != SEE_TRACKS],
     }
     with replacing(path) as partial:
         partial.write_text(render("tracks.html", content), "utf-8")
+
+
+def _number_of(count: int, what: str) -> str:
+    """Such as "1 frame" and "2 frames"."""
+    return f"{count} {what}{'' if count == 1 else 's'}"
 
 
 def _row(story: TrackStory, names: Sequence[str], start_ns: int) -> dict[str, Any]:
@@ -47,7 +53,7 @@ def _row(story: TrackStory, names: Sequence[str], start_ns: int) -> dict[str, An
         "jpeg": story.jpeg,
         "from_s": (story.first_ns - start_ns) * 1e-9,
         "to_s": (story.last_ns - start_ns) * 1e-9,
-        "frames": story.frames,
+        "frames": _number_of(story.frames, "frame"),
         "beliefs": [(names[k], float(story.beliefs[k])) for k in order if story.beliefs[k] >= LEAST_SHOWN],
         "outcomes": story.outcomes.most_common(),
     }
