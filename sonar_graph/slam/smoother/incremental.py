@@ -37,6 +37,8 @@ from sonar_graph.tagged_sections import tagged
 
 MOST_MESSAGES = 1000
 """Kept of what was withheld."""
+LEAST_RUN_AWAY_M = 10.0
+"""Move of a keyframe or landmark in an update up to which no track is too short for it."""
 ROUNDING_S = 1e-6
 """Margin for rounded times: a variable exactly as old as the lag stays."""
 
@@ -122,6 +124,7 @@ class Smoother:
         self._refused: set[int] = set()
         self._left: set[int] = set()
         self._restarted_s = self._newest_s = -np.inf
+        self._newest_pose = 0
         self._expiring: dict[int, float] = {}
         self._held: dict[int, float] = {}
         self._landmarks: list[int] = []
@@ -161,6 +164,7 @@ class Smoother:
                 " give keyframes in the order of time"
             )
         self._insert(key, pose)
+        self._newest_pose = key
         self._newest_s = self._new_times_s[key] = self._expiring[key] = time_s
 
     def add_landmark(self, key: int, point: Floats) -> None:
@@ -295,6 +299,9 @@ class Smoother:
                 return
             estimate = self._window.estimate()
         self._kept_covariance.renew(self._landmarks)
+        if self._has_run_away(estimate):
+            self._restart(time_s)
+            return
         self._clear_new()
         self._take(estimate)
         window, may_restart = self._window, time_s >= self._restarted_s + self.params.lag_s
@@ -302,6 +309,23 @@ class Smoother:
             shift_m = window.largest_shift(self._landmarks)
             if shift_m > self.params.stale_shift_m:
                 self._restart(time_s)
+
+    def _has_run_away(self, estimate: gtsam.Values) -> bool:
+        """True when Gauss-Newton moved the newest keyframe, or a landmark, by more than the extent of track and map.
+
+        It diverges then; damped steps of the whole history from before do not.
+        """
+        if not all(map(estimate.exists, [self._newest_pose, *self._landmarks])):
+            return False
+        before, after = (
+            np.array([v.atPose3(self._newest_pose).translation(), *map(v.atPoint3, self._landmarks)])
+            for v in (self.values, estimate)
+        )
+        moved_m = float(np.linalg.norm(after - before, axis=1).max())
+        if moved_m <= LEAST_RUN_AWAY_M:
+            return False
+        positions = np.vstack([before, gtsam.utilities.extractPose3(self.values)[:, 9:]])
+        return not moved_m <= float(np.linalg.norm(np.ptp(positions, axis=0)))
 
     def _times(self, poses_s: dict[int, float], time_s: float) -> dict[Any, float]:
         """When variables were last seen, from those of poses: landmarks and the newest bias are seen now."""
@@ -392,7 +416,8 @@ class Smoother:
             self._window.begin(graph, self.values, times_s, time_s)
         except RuntimeError as error:
             raise EstimatorError(f"isam2: {self._blame().reasons(graph, self.values)}") from error
-        self._take(self._window.estimate())
+        estimate = self._window.estimate()
+        self._take(gtsam.Values(self.values) if self._has_run_away(estimate) else estimate)
 
     @property
     def landmark_ids(self) -> list[int]:

@@ -263,7 +263,8 @@ class SubmapWindow:
     def _is_bent(self, keys: list[int], estimate: gtsam.Values) -> bool:
         """True where keyframes see a landmark whose height is so little known that its range bends (`MOST_BENT`).
 
-        The height above the first keyframe; its sigma is asked for where the last one that is known is too large.
+        Its height above the first keyframe. While they are not in the window, which is begun anew, the sigma last asked
+        for counts.
         """
         sightings = [
             (factor, key)
@@ -271,26 +272,16 @@ class SubmapWindow:
             if isinstance(factor, gtsam.NoiseModelFactor)
             for key in filter(is_landmark, list(factor.keys()))
         ]
-        sigmas_m = self._height_sigmas_m
-
-        def bent() -> list[int]:
-            found = (
-                key
-                for factor, key in sightings
-                if key not in sigmas_m or not bending(factor, estimate, key, sigmas_m[key]) <= MOST_BENT
-            )
-            return list(dict.fromkeys(found))
-
-        if not (asked := bent()):
-            return False
-        if not all(map(self._isam.valueExists, [keys[0], *asked])):
+        first, seen = keys[0], sorted({key for _, key in sightings})
+        if seen and all(map(self._isam.valueExists, [first, *seen])):
+            joint, up = JointCovariance.of(self._isam, [first, *seen]), estimate.atPose3(first).rotation().matrix()[2]
+            of_pose = up @ joint.at(first, first)[3:, 3:] @ up
+            for key in seen:
+                variance = of_pose - 2 * up @ joint.at(first, key)[3:, 2] + joint.at(key, key)[2, 2]
+                self._height_sigmas_m[key] = math.sqrt(max(0.0, variance))
+        elif not self._height_sigmas_m.keys() >= set(seen):
             return True
-        joint, up = JointCovariance.of(self._isam, [keys[0], *asked]), estimate.atPose3(keys[0]).rotation().matrix()[2]
-        of_pose = up @ joint.at(keys[0], keys[0])[3:, 3:] @ up
-        for key in asked:
-            variance = of_pose - 2 * up @ joint.at(keys[0], key)[3:, 2] + joint.at(key, key)[2, 2]
-            sigmas_m[key] = math.sqrt(max(0.0, variance))
-        return bool(bent())
+        return any(not bending(f, estimate, key, self._height_sigmas_m[key]) <= MOST_BENT for f, key in sightings)
 
     def _add(
         self, interior: list[int], ends: tuple[int, int], parts: tuple[Submap, ...], estimate: gtsam.Values
