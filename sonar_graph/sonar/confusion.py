@@ -22,7 +22,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, FiniteFloat, ValidationError, model_validator
 
 from sonar_graph.calibration import Section
 from sonar_graph.devices import LandmarkDesign
@@ -67,15 +67,15 @@ class Confusion(Section):
     """The designs as measured; without them no recogniser accepts the model."""
     matrix: tuple[tuple[float, ...], ...]
     """p(z = j | x = k), shape (ids + 1, ids + 1); the last row and column are "none of them"."""
-    weights: tuple[float, ...]
+    weights: tuple[FiniteFloat, ...]
     """How much each column of `EVIDENCE` counts, in nats."""
-    looks: float = Field(gt=0)
+    looks: float = Field(gt=0, allow_inf_nan=False)
     """Number of independent looks that give a track half of the log odds of endless ones."""
     doubt: float = Field(5e-4, ge=0, lt=1)
     """Share of tracks whose looks tell nothing: what was never seen in n tracks may still happen in 1 / 2n of them."""
-    range_sigma_m: float = Field(gt=0)
+    range_sigma_m: float = Field(gt=0, allow_inf_nan=False)
     """Standard deviation of the range in a frame that shows the whole landmark."""
-    azimuth_sigma_rad: float = Field(gt=0)
+    azimuth_sigma_rad: float = Field(gt=0, allow_inf_nan=False)
     """The same of the azimuth."""
     height_bias_m: float = Field(0.0, gt=-1, lt=1)
     """Height of the faces that sound sees over the heights of the true landmarks."""
@@ -88,6 +88,8 @@ class Confusion(Section):
     def _is_stochastic(self) -> Confusion:
         matrix = np.array(self.matrix, float, ndmin=2) if len({len(r) for r in self.matrix}) == 1 else np.empty((0, 0))
         classes = len(self.ids) + 1
+        if len(set(self.ids)) < len(self.ids):
+            raise ValueError(f"ids: expected each once, not {', '.join(map(str, self.ids))}")
         if self.designs and len(self.designs) != len(self.ids):
             raise ValueError(f"designs: expected one for each of {len(self.ids)} ids, not {len(self.designs)}")
         if matrix.shape != (classes, classes):

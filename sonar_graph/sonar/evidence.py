@@ -44,6 +44,8 @@ SHADOW_CELLS, OWN_SHADOW_CELLS, NEAR_CELLS, BEHIND_CELLS = 7, 2, 4, 3
 LEAST_CELLS = 60
 LEAST_BETA_DB, LEAST_DB2 = 0.5, 0.3
 """Floors of logarithms."""
+LEAST_VARIANCE_DB2 = 0.1
+"""Variance of a patch up to which it shows no speckle and nothing else: 5.57 dB squared over 300 looks."""
 OUT, PART = 0.12, 0.5
 """Shares of a cell in a figure: up to the first it lies outside, from the second on inside."""
 NEAR, BEHIND, FAR = 1, 2, 4
@@ -96,7 +98,7 @@ class Figures:
     def evidence(self, patch: Patch, template: int, first: tuple[int, int]) -> Floats | None:
         """`EVIDENCE` of a template on the part of a patch that begins at this cell, shape (9,).
 
-        None where too little of it is in view.
+        None where too little of it is in view, or where it has one level.
         """
         one, side = self._designs[template], len(patch.level_db)
         at = (one.rows + first[0]) * side + one.aside + first[1]
@@ -112,6 +114,8 @@ class Figures:
             values = values * seen
             gram = values @ values.T
         products, total = (values @ level).astype(float), float(level @ level)
+        if total < LEAST_VARIANCE_DB2 * count:
+            return None
         return _evidence(
             gram.astype(float), products, total, count, one.has_dark, smooth - np.float32(mean), patch.held.ravel()[at],
             one.smooth, one.zones, level, seen,

@@ -212,6 +212,12 @@ def test_gain_and_floor_level_change_nothing(appearance):
     assert min(off, 2 * np.pi / 3 - off) < np.radians(5)
 
 
+def test_a_patch_of_one_level_says_nothing(appearance):
+    image = image_db(DEFAULT_DESIGNS[2], (1.7, 0.0), 0.4, ROTATION, np.random.default_rng(0))
+    assert _fit(appearance, np.full_like(image, 30.0), (1.7, 0.0)) is None
+    assert _fit(appearance, image, (1.7, 0.0)) is not None
+
+
 @pytest.mark.parametrize("design", DEFAULT_DESIGNS, ids=lambda design: design.name)
 def test_weaker_contrast_lowers_the_odds_and_not_the_ranking(appearance, design):
     strong, weak = (
