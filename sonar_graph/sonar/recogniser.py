@@ -61,7 +61,7 @@ class Fate(NamedTuple):
 
 
 REPORTED = "reported"
-NOT_INDEPENDENT = "not reported: its error is still that of the track's last detection"
+NOT_INDEPENDENT = "not reported: too soon after the track's last detection to be independent of it"
 REJECTED = {int(v): f"candidate rejected: {v.name.lower().replace('_', ' ')}" for v in CandidateVerdict}
 
 
