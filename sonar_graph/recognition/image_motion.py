@@ -184,7 +184,7 @@ class ImageMotions:
         if self._is_fixed:
             return None
         frame = with_lens(frame, self._calibration.sonar.lens)
-        if self._floor is None or not _is_alike(self._floor[0], frame):
+        if self._floor is None or not is_alike(self._floor[0], frame):
             view = self.view or SLANT_PLANE
             self._floor, self._before = (frame, FloorPicture(frame.ranges_m, frame.azimuths_rad, view)), None
         raster = self._floor[1]
@@ -235,7 +235,7 @@ class ImageMotions:
         return {"detections.motion": f"from the images: {self.measured} of {self.steps} steps measured"}
 
 
-def _is_alike(one: SonarFrames, other: SonarFrames) -> bool:
+def is_alike(one: SonarFrames, other: SonarFrames) -> bool:
     """True for frames with the same beams and bins."""
     pairs = (one.ranges_m, other.ranges_m), (one.azimuths_rad, other.azimuths_rad)
     return all(a is b or np.array_equal(a, b) for a, b in pairs)

@@ -19,6 +19,7 @@ import numpy as np
 
 from sonar_graph.calibration import SonarCalibration
 from sonar_graph.images import SonarFrames, decibels
+from sonar_graph.recognition.image_motion import is_alike
 from sonar_graph.recognition.labels import Label, Labels
 from sonar_graph.recognition.recognition_record import as_jpeg, draw_fan
 from sonar_graph.recognition.session import one_by_one
@@ -60,13 +61,13 @@ def shown_frames(
         stamp_ns = int(frame.stamps_ns[0])
         if shown and stamp_ns - shown[-1].stamp_ns < period_ns:
             continue
-        if fan is None or frame.ranges_m is not fan[0].ranges_m or frame.azimuths_rad is not fan[0].azimuths_rad:
+        if fan is None or not is_alike(frame, fan[0]):
             fan = frame, Fan.of(frame.ranges_m, frame.azimuths_rad, PIXELS_HIGH)
         picture = draw_fan(decibels(frame.intensity[0], sonar.image), fan[1], None)
         shown.append(ShownFrame(stamp_ns, as_jpeg(picture), fan[1]))
         if len(shown) > MOST_FRAMES:
             del shown[1::2]
-            period_ns = 2 * max(period_ns, shown[1].stamp_ns - shown[0].stamp_ns)
+            period_ns = max(2 * period_ns, shown[1].stamp_ns - shown[0].stamp_ns)
         progress(len(shown))
     return shown
 

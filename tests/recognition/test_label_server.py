@@ -13,6 +13,7 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from threading import Thread
 
@@ -71,6 +72,14 @@ def test_of_many_frames_those_that_are_shown_are_spread_over_the_log(lane, monke
     shown = shown_frames(one_by_one(lane.frames), lane.sequence.calibration.sonar, 0, lambda _: None)
     assert 4 <= len(shown) <= 10
     assert shown[-1].stamp_ns > lane.frames.stamps_ns[-1] - 10_000_000_000
+    gaps_ns = np.diff([frame.stamp_ns for frame in shown])
+    assert gaps_ns.max() < 1.5 * gaps_ns.min()
+
+
+def test_frames_of_the_same_beams_and_bins_share_one_fan_whichever_block_they_come_in(lane):
+    blocks = [replace(lane.one(row), ranges_m=lane.frames.ranges_m.copy()) for row in range(4)]
+    shown = shown_frames(blocks, lane.sequence.calibration.sonar, 0, lambda _: None)
+    assert len({id(frame.fan) for frame in shown}) == 1 < len(shown)
 
 
 def test_only_who_knows_the_word_and_names_the_host_is_answered(server):
