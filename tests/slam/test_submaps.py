@@ -8,13 +8,13 @@ from gtsam.symbol_shorthand import B, L, X
 from sonar_graph.slam.models import factors
 from sonar_graph.slam.smoother import FactorGroup, submap_window
 from sonar_graph.slam.smoother.batch_solution import picked
-from sonar_graph.slam.smoother.submap_window import Submap
+from sonar_graph.slam.smoother.submap_window import Submap, bending
 from sonar_graph.slam.smoother.submaps import SubmapFactor, turn_from, yaw_from
 from sonar_graph.testing import check_derivative
 
 from .fed import Fed, assert_is_least_squares, in_the_basin, on_the_rail
 from .graphs import off_sigmas
-from .made import graph_of, point_prior, pose_prior, values_of
+from .made import graph_of, huber, isotropic, plain, point_prior, pose_prior, values_of
 from .rail import STEP_S, rail
 
 KEYS = [X(3), X(9), L(1), L(2), B(0)]
@@ -202,6 +202,23 @@ def test_among_landmarks_at_its_height_a_live_estimate_is_near_that_with_all_pos
     control = [jumps_m(seed, -0.05) for seed in range(3)]
     assert np.median(found) < 0.02
     assert np.median(control) > 0.1
+
+
+def test_a_range_bends_by_the_square_of_a_height_whatever_its_kernel():
+    """At the sonar's own height, ``(sqrt(r^2 + h^2) - r) / sigma`` for a step h up or down; a kernel is of outliers."""
+    values, noise = values_of(X1=gtsam.Pose3(), L1=np.array([10.0, 0.0, 0.0])), isotropic(1, 0.05)
+    for kernel in (plain, huber):
+        seen = gtsam.RangeFactor3D(X(1), L(1), 12.0, kernel(noise))
+        assert bending(seen, values, L(1), 1.0) == pytest.approx((np.sqrt(101.0) - 10.0) / 0.05, rel=1e-9)
+
+
+def test_a_window_begun_anew_waits_for_landmarks_whose_heights_it_has_never_asked_for():
+    fed = in_the_basin(12, 2.0)
+    window, smoother = submap_window.SubmapWindow(1e-6, 2.0, 1), fed.smoother
+    times_s = {X(k): float(k) for k in range(12)}
+    window.begin(graph_of(fed.given), smoother.solve_history()[0], times_s, 11.0)
+    assert not window._submaps
+    assert window._waiting
 
 
 def test_keyframes_become_a_submap_once_the_heights_of_what_they_see_are_known():
