@@ -16,7 +16,8 @@ the pose after the motion, in the body's own axes, to which state and motion con
 
 A point q of the body moves by ``R' (rho - [q]x theta)``: along a direction n, in body axes, ``H_b = [(q x n)^T, n^T]``.
 The paper has no headings: c, the constant bias of a compass, is ours, and without headings nothing is learnt of it.
-W, E: `sonar_graph.numerics.matrices`. Derivation and choices that the paper leaves open: docs/theory/ekf_slam.md.
+W, E: `sonar_graph.numerics.matrices`; E is infinite at a pitch of 90°, and no angles are nearer to it than `upright`
+says. Derivation and choices that the paper leaves open: docs/theory/ekf_slam.md.
 """
 
 import math
@@ -61,8 +62,16 @@ from sonar_graph.slam.models import (
 
 POSE, COMPASS, MAP, LANDMARK = 6, 6, 7, 3
 """Length of x_v, place of c, that of p_1, and length of p_i."""
+MOST_PITCH_RAD = 0.5 * math.pi - 1e-3
+"""Nearer to 90° Euler angles count as singular."""
 
 # -------------------------------------------------------------------------------- prediction
+
+
+@inlined
+def upright(angles: Vec3) -> Vec3:
+    """Angles of a rotation, (phi, theta, psi), at which E is finite: by 1 mrad at most another attitude."""
+    return Vec3(angles.x, max(-MOST_PITCH_RAD, min(angles.y, MOST_PITCH_RAD)), angles.z)
 
 
 @compiled
@@ -70,7 +79,7 @@ def predict(x: Floats, P: Floats, dR_: Floats, dp_: Floats, C: Floats) -> None:
     """Carry state and covariance over a motion: ``P_vv <- F P_vv F^T + G C G^T``, ``P_vm <- F P_vm``."""
     dR, dp, angles = mat(dR_), vec(dp_), vec(x[3:])
     R, W = rotation_from_euler(angles), body_rates_from_euler(angles)
-    X_after, angles_after = vec(x) + R @ dp, euler_from_rotation(R @ dR)
+    X_after, angles_after = vec(x) + R @ dp, upright(euler_from_rotation(R @ dR))
     E = euler_rates_from_body(angles_after)
     F = Mat6(I3, -1.0 * (R @ skew(dp) @ W), O3, E @ dR.T @ W)
     G = Mat6(O3, R @ dR, E, O3)

@@ -10,7 +10,18 @@ import gtsam
 import numpy as np
 
 from baselines import ekf_equations
-from baselines.ekf_equations import COMPASS, LANDMARK, MAP, POSE, correct_depth, correct_up, observe, predict
+from baselines.ekf_equations import (
+    COMPASS,
+    LANDMARK,
+    MAP,
+    MOST_PITCH_RAD,
+    POSE,
+    correct_depth,
+    correct_up,
+    observe,
+    predict,
+    upright,
+)
 from baselines.event_order import (
     DEPTH,
     EPOCH,
@@ -26,14 +37,11 @@ from baselines.event_order import (
 from baselines.filter import FilterParams, FilterShell
 from baselines.sonar_update import Gate
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
-from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats
 from sonar_graph.motion import MotionSource
 from sonar_graph.numerics import compiled, rotation_from_euler, vec
 from sonar_graph.slam.landmarks import ACCEPTED
-
-SINGULAR_COSINE = 1e-3
-"""Below this cosine of the pitch the Euler angles are taken as singular."""
+from sonar_graph.slam.models import wrap_angle
 
 
 @compiled
@@ -72,7 +80,7 @@ def advance(
         else:
             break
         k += 1
-        if math.cos(x[4]) < SINGULAR_COSINE:
+        if abs(wrap_angle(x[4])) >= MOST_PITCH_RAD:
             break
     return k
 
@@ -112,7 +120,8 @@ class EkfSlam(FilterShell):
     def __init__(self, calibration: Calibration, odometry: MotionSource, params: EkfSlamParams | None = None) -> None:
         super().__init__(calibration, odometry, params or EkfSlamParams())
         start = calibration.start
-        self._x, self._P = np.array([*start.position_m, *start.pose().rotation().rpy(), 0.0]), np.zeros((MAP, MAP))
+        angles = upright(vec(start.pose().rotation().rpy()))
+        self._x, self._P = np.array([*start.position_m, *angles, 0.0]), np.zeros((MAP, MAP))
         E = np.linalg.inv(np.array(ekf_equations.after(self._x, np.eye(3), np.zeros(3))[2].b))  # W^-1
         self._P[:3, :3] = np.diag(np.square(start.position_sigma_m))
         self._P[3:6, 3:6] = E @ np.diag(np.square(start.rpy_sigma_rad)) @ E.T
@@ -124,31 +133,19 @@ class EkfSlam(FilterShell):
         return self.node_ns, self._x.copy(), self._P.copy()
 
     def advance(self, events: Events, k: int) -> int:
-        """Predict over epochs and correct by depth, from event k on.
-
-        Raises
-        ------
-        EstimatorError
-            When the pitch comes so near 90 degrees that the Euler angles are singular.
-        """
+        """Predict over epochs and correct by depth, from event k on, and take note of a pitch of 90 degrees or more."""
         state = self._x, self._P, self.turned, self.impulse
         k = advance(*state, self.earth, self.port, self.depth_variance, *self.sonar[:3], events, k)
-        if math.cos(self._x[4]) >= SINGULAR_COSINE:
-            return k
-        pitch_deg, at_ns = math.degrees(self._x[4]), int(events.start_ns[k])
-        if abs(math.cos(self._x[4])) < SINGULAR_COSINE:
-            raise EstimatorError(
-                f"ekf-slam: pitch is {pitch_deg:.2f} deg at {at_ns} ns, where the Euler angles of its state are"
-                " singular; use isam2 for this log"
-            )
-        self._overturned = self._overturned or [
-            f"pitch was corrected to {pitch_deg:.0f} deg, first at {at_ns} ns, as no vehicle's is: the filter has lost"
-            " its way, by wrong gyros, velocities or detections; or it needs another estimator, such as isam2"
-        ]
+        if abs(wrap_angle(self._x[4])) >= MOST_PITCH_RAD:
+            self._overturned = self._overturned or [
+                f"pitch came to {math.degrees(self._x[4]):.0f} deg, first at {int(events.start_ns[k])} ns, where the"
+                " Euler angles of its state are singular, or beyond: the filter has lost its way, by wrong gyros,"
+                " velocities or detections; or it needs another estimator, such as isam2"
+            ]
         return k  # the next prediction reads the angles from the rotation, within a right angle again
 
     def withheld(self) -> list[str]:
-        """Messages about detections of the gate, and about a pitch beyond 90 degrees."""
+        """Messages about detections of the gate, and about a pitch of 90 degrees or more."""
         return [*super().withheld(), *self._overturned]
 
     def correct_plane(self, plane: PlanarMotion) -> None:
