@@ -6,7 +6,7 @@ import pytest
 from gtsam.symbol_shorthand import B, L, X
 
 from sonar_graph.slam.models import factors
-from sonar_graph.slam.smoother import FactorGroup, submap_window
+from sonar_graph.slam.smoother import FactorGroup, incremental, submap_window
 from sonar_graph.slam.smoother.batch_solution import picked
 from sonar_graph.slam.smoother.submap_window import Submap, bending
 from sonar_graph.slam.smoother.submaps import SubmapFactor, turn_from, yaw_from
@@ -14,7 +14,7 @@ from sonar_graph.testing import check_derivative
 
 from .fed import Fed, assert_is_least_squares, in_the_basin, on_the_rail
 from .graphs import off_sigmas
-from .made import graph_of, huber, isotropic, plain, point_prior, pose_prior, values_of
+from .made import graph_of, huber, isotropic, motion_of, plain, point_prior, pose_prior, values_of
 from .rail import STEP_S, rail
 
 KEYS = [X(3), X(9), L(1), L(2), B(0)]
@@ -247,20 +247,46 @@ def sigmas_off(fed: Fed) -> float:
     return max(found)
 
 
-def test_where_gauss_newton_runs_away_the_live_estimate_is_that_of_damped_steps(monkeypatch):
-    """Farther than the extent of track and map, as by a Doppler log that looks astern."""
-    fed, update = in_the_basin(12, 4.0), submap_window.SubmapWindow.update
+def running_away(monkeypatch) -> list[float]:
+    """Let each update of a window throw a landmark ten kilometres off; the times when the history is solved."""
+    update, solve, now_s, solved_s = submap_window.SubmapWindow.update, incremental.solve_in_sight, [0.0], list[float]()
 
-    def overshooting(window, *arguments) -> gtsam.Values:
-        estimate = update(window, *arguments)
+    def overshooting(window, graph, values, times_s, time_s, *more) -> gtsam.Values:
+        now_s[0], estimate = time_s, update(window, graph, values, times_s, time_s, *more)
         estimate.update(L(5), np.array([1e4, 0.0, 0.0]))
         return estimate
 
+    def noted(*arguments) -> gtsam.Values:
+        solved_s.append(now_s[0])
+        return solve(*arguments)
+
     monkeypatch.setattr(submap_window.SubmapWindow, "update", overshooting)
+    monkeypatch.setattr(incremental, "solve_in_sight", noted)
+    return solved_s
+
+
+def test_where_gauss_newton_runs_away_the_live_estimate_is_that_of_damped_steps(monkeypatch):
+    """Farther than the extent of track and map, as by a Doppler log that looks astern."""
+    fed = in_the_basin(12, 4.0)
+    running_away(monkeypatch)
     fed.add({"prior": point_prior(L(3), fed.smoother.values.atPoint3(L(3)), 0.1)})
     fed.smoother.flush(11.0)
     batch, _ = fed.smoother.solve_history()
     assert fed.smoother.values.atPoint3(L(5)) == pytest.approx(batch.atPoint3(L(5)), abs=1e-3)
+
+
+def test_while_gauss_newton_runs_away_the_history_is_solved_once_a_lag_and_odometry_goes_on_in_between(monkeypatch):
+    """So that measurements which contradict each other for long do not cost a solution of all of them an update."""
+    fed, moved = in_the_basin(12, 4.0), gtsam.Pose3(gtsam.Rot3(), np.array([0.5, 0.0, 0.0]))
+    solved_s, cov = running_away(monkeypatch), 1e-4 * np.eye(6)
+    for k in range(12, 22):
+        expected = fed.smoother.values.atPose3(X(k - 1)).compose(moved)
+        fed.smoother.add_pose(X(k), expected, float(k))
+        fed.add({"odometry": factors.odometry(X(k - 1), X(k), motion_of(moved, cov))})
+        fed.smoother.update(float(k))
+        assert k in solved_s or fed.smoother.values.atPose3(X(k)).equals(expected, 1e-3)
+        assert fed.joint(X(k)).shape == (6, 6)
+    assert solved_s == [12.0, 16.0, 20.0]
 
 
 @pytest.mark.usefixtures("heights_do_not_matter")

@@ -5,9 +5,8 @@ Two solutions share the same factors (docs/theory/isam2.md). The *window* is GTS
 when the smoothed result is asked for; when it is *bounded*, the window's factors and the marginals of what has left.
 
 Marginalising freezes the linearisation of the landmarks that it touches. When one has since moved by more than
-``stale_shift_m``, the history is solved and the window starts again from that solution; the graph must have grown by
-`RESTART_GROWTH` since, so that all restarts together cost some times the last one. The window also starts again when a
-factor is taken out that has been marginalised.
+``stale_shift_m``, the history is solved and the window starts again from that solution, once a lag. The window also
+starts again when a factor is taken out that has been marginalised, and whenever a step runs away.
 """
 
 from collections import deque
@@ -300,7 +299,7 @@ class Smoother:
             estimate = self._window.estimate()
         self._kept_covariance.renew(self._landmarks)
         if self._has_run_away(estimate):
-            self._restart(time_s)
+            self._restart(time_s, solves=time_s >= self._restarted_s + self.params.lag_s)
             return
         self._clear_new()
         self._take(estimate)
@@ -405,12 +404,13 @@ class Smoother:
         self._store.take_up()
         self._new_values, self._new_times_s, self._waiting_gain = gtsam.Values(), {}, 0.0
 
-    def _restart(self, time_s: float) -> None:
-        """Solve the history; start the window from that."""
+    def _restart(self, time_s: float, *, solves: bool = True) -> None:
+        """Solve the history, or leave the estimate as it is; start the window from that."""
         graph = self.graph
         self._clear_new()
-        self._restarted_s = time_s
-        self.values = solve_in_sight(graph, self.values, self._store.sightlines())
+        if solves:
+            self._restarted_s = time_s
+            self.values = solve_in_sight(graph, self.values, self._store.sightlines())
         times_s = self._expiring | dict.fromkeys(self._landmarks, time_s)
         try:
             self._window.begin(graph, self.values, times_s, time_s)
