@@ -106,25 +106,29 @@ def in_the_basin(
     *,
     height_m: float = -1.0,
     sonar: gtsam.Pose3 = SONAR,
+    roll_rad: float = 0.0,
 ) -> Fed:
     """Circles past three landmarks with a gyro bias that walks between stretches; nothing about it is linear.
 
-    The landmarks lie about a height that the smoother is not told.
+    The landmarks lie about a height that the smoother is not told. ``roll_rad``: of the body's axes, by which sonar and
+    path stay where they are.
     """
-    rng = np.random.default_rng(seed)
+    rng, rolled = np.random.default_rng(seed), gtsam.Pose3(gtsam.Rot3.Rx(roll_rad), np.zeros(3))
+    sonar = rolled.inverse().compose(sonar)
     turn = gtsam.Pose3(gtsam.Rot3.Rz(0.25), np.array([0.5, 0.0, 0.0]))
     landmarks = {3: np.array([3.0, 1.0, 0.0]), 5: np.array([2.0, 4.0, 0.2]), 8: np.array([-1.0, 2.5, -0.2])}
     landmarks = {i: p + height_m * np.eye(3)[2] for i, p in landmarks.items()}
     cov = np.diag([1e-4] * 3 + [4e-4] * 3)
-    fed, truth, seen = Fed(lag_s, stale_shift_m), gtsam.Pose3(), set()
-    fed.smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
+    fed, truth, seen = Fed(lag_s, stale_shift_m), rolled, set()
+    fed.smoother.add_pose(X(0), rolled, 0.0)
     fed.smoother.add_bias(B(0), np.zeros(11))
     prior = gtsam.noiseModel.Diagonal.Sigmas(np.array([0.01] * 3 + [0.02] * 3))
-    fed.add({"start prior": gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), prior)})
+    fed.add({"start prior": gtsam.PriorFactorPose3(X(0), rolled, prior)})
     fed.add({"bias prior": factors.bias_prior(B(0), np.full(11, 0.01))})
     for k in range(1, steps):
-        truth = truth.compose(turn)
+        truth = truth.compose(rolled.inverse()).compose(turn).compose(rolled)
         moved = turn.compose(gtsam.Pose3.Expmap(np.sqrt(np.diag(cov)) * rng.standard_normal(6)))
+        moved = rolled.inverse().compose(moved).compose(rolled)
         motion = motion_of(moved, cov, -np.eye(6, 11) * (np.arange(11) < 3))
         fed.smoother.add_pose(X(k), fed.smoother.values.atPose3(X(k - 1)).compose(moved), float(k))
         fed.add({"odometry": OdometryWithBias(X(k - 1), X(k), B((k - 1) // bias_steps), motion)})

@@ -212,6 +212,17 @@ def test_a_range_bends_by_the_square_of_a_height_whatever_its_kernel():
         assert bending(seen, values, L(1), 1.0) == pytest.approx((np.sqrt(101.0) - 10.0) / 0.05, rel=1e-9)
 
 
+def test_what_waits_for_heights_does_not_depend_on_the_axes_of_the_body():
+    """Rolled, a pose has the same height, but another share of it in each of the body's own axes."""
+    found = []
+    for roll_rad in (0.0, 1.5):
+        window = in_the_basin(40, 4.0, height_m=-0.6, sonar=gtsam.Pose3(), roll_rad=roll_rad).smoother._window
+        found.append(([keys[0] for keys in window._waiting], [submap.ends for submap in window._submaps]))
+    level, rolled = found
+    assert rolled == level
+    assert all(level)
+
+
 def test_a_window_begun_anew_waits_for_landmarks_whose_heights_it_has_never_asked_for():
     fed = in_the_basin(12, 2.0)
     window, smoother = submap_window.SubmapWindow(1e-6, 2.0, 1), fed.smoother
