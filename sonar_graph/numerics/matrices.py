@@ -121,6 +121,9 @@ Index = tuple[int | np.integer[Any], ...]
 UPPER_LEFT, UPPER_RIGHT, LOWER_LEFT, LOWER_RIGHT = itertools.product(np.arange(0, 6, 3), repeat=2)
 """First elements of the blocks of a 6 by 6 array; not literals, for each of which numba would compile anew."""
 
+SERIES_RAD2 = 1e-2
+"""Squared angle below which the series of `curvature` serve: their next terms are below 1e-12."""
+
 
 @inlined
 def cross(a: Vec3, b: Vec3) -> Vec3:
@@ -144,6 +147,12 @@ def diagonal(v: Vec3) -> Mat3:
 def vec(a: Any) -> Vec3:
     """Vector from the first three numbers of an array or tuple."""
     return Vec3(a[0], a[1], a[2])
+
+
+@inlined
+def outer(a: Vec3, b: Vec3) -> Mat3:
+    """``a b^T``."""
+    return Mat3(a.x * b, a.y * b, a.z * b)
 
 
 @inlined
@@ -205,6 +214,43 @@ def rodrigues(phi: Vec3, x: float, a: float, b: float) -> Mat3:
         Vec3(b * q * p + a * r, d + b * q * q, b * q * r - a * p),
         Vec3(b * r * p - a * q, b * r * q + a * p, d + b * r * r),
     )
+
+
+@inlined
+def rotation_log(R: Mat3) -> Vec3:
+    """Rotation vector, at any angle, by the largest part of the quaternion (Shepperd, JGC 1(3), 1978)."""
+    xx, yy, zz = R.x.x, R.y.y, R.z.z
+    across = Vec3(R.z.y - R.y.z, R.x.z - R.z.x, R.y.x - R.x.y)
+    w2 = xx + yy + zz
+    if w2 >= max(xx, yy, zz):
+        w, v = 1.0 + w2, across
+    elif xx >= yy and xx >= zz:
+        w, v = across.x, Vec3(1.0 + xx - yy - zz, R.x.y + R.y.x, R.x.z + R.z.x)
+    elif yy >= zz:
+        w, v = across.y, Vec3(R.x.y + R.y.x, 1.0 + yy - zz - xx, R.y.z + R.z.y)
+    else:
+        w, v = across.z, Vec3(R.x.z + R.z.x, R.y.z + R.z.y, 1.0 + zz - xx - yy)
+    if w < 0.0:
+        w, v = -w, -1.0 * v
+    n = math.sqrt(v @ v)
+    return (2.0 * math.atan2(n, w) / n if n > 0.0 else 0.0) * v
+
+
+@inlined
+def curvature(x: float) -> tuple[float, float]:
+    """``a = (1 - y cot y) / x``, y half the angle of the square x, and its derivative by the angle, over the angle."""
+    if x < SERIES_RAD2:
+        return 1.0 / 12.0 + x * (1.0 / 720.0 + x / 30240.0), 1.0 / 360.0 + x * (1.0 / 7560.0 + x / 201600.0)
+    half = 0.5 * math.sqrt(x)
+    g = half / math.tan(half)
+    return (1.0 - g) / x, ((half / math.sin(half)) ** 2 + g - 2.0) / (x * x)
+
+
+@inlined
+def chord_inverse(theta: Vec3) -> Mat3:
+    """``J_l(theta)^-1 = I - [theta]x / 2 + a [theta]x^2``, a as in `curvature`; its transpose is that of Log."""
+    x = theta @ theta
+    return rodrigues(theta, x, -0.5, curvature(x)[0])
 
 
 @inlined

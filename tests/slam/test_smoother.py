@@ -10,10 +10,23 @@ from sonar_graph.slam.models import factors
 from sonar_graph.slam.smoother import batch_solution
 from sonar_graph.slam.smoother.batch_solution import solve
 from sonar_graph.slam.smoother.factor_store import FactorGroup
+from sonar_graph.slam.smoother.fixed_lag import FixedLagWindow
+from sonar_graph.slam.smoother.submap_window import SubmapWindow
 
 from .fed import FOREVER_S, NEVER_M, SONAR, Fed, assert_is_least_squares, in_the_basin, on_the_rail, ranged
 from .graphs import block_of, off_sigmas
-from .made import counted, graph_of, isotropic, motion_of, plain, point_prior, polar, pose_prior, smoother_with
+from .made import (
+    counted,
+    graph_of,
+    isotropic,
+    motion_of,
+    plain,
+    point_prior,
+    polar,
+    pose_prior,
+    smoother_with,
+    values_of,
+)
 from .rail import STEP_S, Rail, rail
 
 NODES = 21
@@ -316,3 +329,22 @@ def test_a_start_that_is_hardly_known_is_smoothed_to_the_end():
         fed.smoother.update(float(k))
     assert fed.smoother._window.is_by_qr
     assert np.linalg.norm(fed.smoother.values.atPose3(X(99)).translation() - truth.translation()) < 0.05
+
+
+@pytest.mark.parametrize("make", [SubmapWindow, FixedLagWindow])
+def test_a_factor_in_python_is_handed_no_copy_of_all_values(make):
+    """GTSAM would copy them for each: of 600 variables that takes longer than the factor."""
+    window = make(1e-9, 1e9, 10) if make is SubmapWindow else make(1e-9, 1e9)
+    handed = []
+
+    def error(_, values, jacobians):
+        handed.append(values is window.linearised_at)
+        if jacobians is not None:
+            jacobians[0] = np.eye(6)
+        return gtsam.Pose3.Logmap(values.atPose3(X(0))) - 0.1
+
+    factor = gtsam.CustomFactor(isotropic(6, 1.0), [X(0)], error)
+    for graph, values in ((graph_of([factor]), values_of(X0=gtsam.Pose3())), (graph_of([]), gtsam.Values())):
+        window.update(graph, values, dict.fromkeys(values.keys(), 0.0), 0.0)
+    assert len(handed) > 1
+    assert all(handed)

@@ -15,7 +15,7 @@ import numpy as np
 
 from sonar_graph.measurements import Floats
 from sonar_graph.slam.models.sonar_model import wrap_angle
-from sonar_graph.slam.models.views import poses_of, range_azimuth_jacobians
+from sonar_graph.slam.models.views import poses_of, project_all
 
 UNIT = gtsam.noiseModel.Unit.Create(2)
 
@@ -23,17 +23,18 @@ UNIT = gtsam.noiseModel.Unit.Create(2)
 class SightingError:
     """Error of one such factor, as GTSAM asks for it."""
 
-    __slots__ = ("body_T_sonar", "keys", "z")
+    __slots__ = ("body_T_sonar", "by_body", "keys", "z")
 
     def __init__(self, keys: tuple[int, int], body_T_sonar: gtsam.Pose3, z: Floats) -> None:
         self.keys, self.body_T_sonar, self.z = keys, body_T_sonar, z
+        self.by_body = body_T_sonar.inverse().AdjointMap()
 
     def __call__(self, _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:
         """Error, shape (2,), m and rad."""
-        X, p = values.atPose3(self.keys[0]), values.atPoint3(self.keys[1])
-        predicted, by_pose, by_landmark = range_azimuth_jacobians(X, self.body_T_sonar, p)
+        world_T_sonar = values.atPose3(self.keys[0]).compose(self.body_T_sonar).matrix()
+        (predicted,), (by_sonar,), (by_landmark,) = project_all(values.atPoint3(self.keys[1])[None], world_T_sonar)
         if jacobians is not None:
-            jacobians[0], jacobians[1] = by_pose, by_landmark
+            jacobians[0], jacobians[1] = by_sonar @ self.by_body, by_landmark
         return np.array([predicted[0] - self.z[0], wrap_angle(predicted[1] - self.z[1])])
 
 
@@ -48,7 +49,7 @@ class SightingStack:
         self._landmarks = np.searchsorted(self._landmark_keys, [law.keys[1] for law in laws])
         sonars = np.array([law.body_T_sonar.matrix() for law in laws])
         self._body_R_sonar, self._body_p_sonar = sonars[:, :3, :3], sonars[:, :3, 3]
-        self._by_body = np.array([law.body_T_sonar.inverse().AdjointMap() for law in laws])
+        self._by_body = np.array([law.by_body for law in laws])
         self._z = np.array([law.z for law in laws])
         noises: list[Any] = [factor.noiseModel() for factor in factors]
         robust = [isinstance(noise, gtsam.noiseModel.Robust) for noise in noises]

@@ -8,8 +8,6 @@ With ``E = (R, t)``, ``theta = Log(R)`` and V the mean of ``Exp(s theta)`` over 
         [ B V^-T V^-T ]
 """
 
-import math
-
 import numpy as np
 
 from sonar_graph.measurements import Floats
@@ -20,17 +18,18 @@ from sonar_graph.numerics import (
     Mat6,
     Vec3,
     Vec6,
+    chord_inverse,
     compiled,
+    curvature,
     exp_and_mean,
     inlined,
     mat6,
+    outer,
     rodrigues,
+    rotation_log,
     skew,
     vec,
 )
-
-SERIES_RAD2 = 1e-2
-"""Squared angle below which series serve: their next terms are below 1e-12."""
 
 
 @compiled
@@ -110,43 +109,6 @@ def pose(rows: Floats) -> tuple[Mat3, Vec3]:
 
 
 @inlined
-def rotation_log(R: Mat3) -> Vec3:
-    """Rotation vector, at any angle, by the largest part of the quaternion (Shepperd, JGC 1(3), 1978)."""
-    xx, yy, zz = R.x.x, R.y.y, R.z.z
-    across = Vec3(R.z.y - R.y.z, R.x.z - R.z.x, R.y.x - R.x.y)
-    w2 = xx + yy + zz
-    if w2 >= max(xx, yy, zz):
-        w, v = 1.0 + w2, across
-    elif xx >= yy and xx >= zz:
-        w, v = across.x, Vec3(1.0 + xx - yy - zz, R.x.y + R.y.x, R.x.z + R.z.x)
-    elif yy >= zz:
-        w, v = across.y, Vec3(R.x.y + R.y.x, 1.0 + yy - zz - xx, R.y.z + R.z.y)
-    else:
-        w, v = across.z, Vec3(R.x.z + R.z.x, R.y.z + R.z.y, 1.0 + zz - xx - yy)
-    if w < 0.0:
-        w, v = -w, -1.0 * v
-    n = math.sqrt(v @ v)
-    return (2.0 * math.atan2(n, w) / n if n > 0.0 else 0.0) * v
-
-
-@inlined
-def curvature(x: float) -> tuple[float, float]:
-    """Factor a of an angle of the square x, and its derivative by the angle, over the angle."""
-    if x < SERIES_RAD2:
-        return 1.0 / 12.0 + x * (1.0 / 720.0 + x / 30240.0), 1.0 / 360.0 + x * (1.0 / 7560.0 + x / 201600.0)
-    half = 0.5 * math.sqrt(x)
-    g = half / math.tan(half)
-    return (1.0 - g) / x, ((half / math.sin(half)) ** 2 + g - 2.0) / (x * x)
-
-
-@inlined
-def chord_inverse(theta: Vec3) -> Mat3:
-    """V^-1 of a rotation vector."""
-    x = theta @ theta
-    return rodrigues(theta, x, -0.5, curvature(x)[0])
-
-
-@inlined
 def log_derivative(theta: Vec3, t: Vec3) -> Mat6:
     """J of the transform ``(Exp(theta), t)``: ``Log(T Exp(d)) ~ Log(T) + J d``."""
     x, along = theta @ theta, theta @ t
@@ -162,12 +124,6 @@ def inverse_adjoint(T: tuple[Mat3, Vec3]) -> Mat6:
     """``Ad(T^-1)``."""
     R, t = T
     return Mat6(R.T, O3, -1.0 * (R.T @ skew(t)), R.T)
-
-
-@inlined
-def outer(a: Vec3, b: Vec3) -> Mat3:
-    """``a b^T``."""
-    return Mat3(a.x * b, a.y * b, a.z * b)
 
 
 @inlined

@@ -26,6 +26,11 @@ def poses_of(values: gtsam.Values, keys: NDArray[np.uint64]) -> Floats:
     return poses[np.searchsorted(known[known >> np.uint64(56) == ord("x")], keys)]
 
 
+def pose_row(pose: gtsam.Pose3) -> Floats:
+    """Rows of R, and p, shape (12,)."""
+    return np.concatenate((pose.rotation().matrix().ravel(), pose.translation()))
+
+
 @compiled
 def project_all(points: Floats, world_T_sonar: Floats) -> tuple[Floats, Floats, Floats]:
     """Range and azimuth of points of the world, shape (m, 3), from a sonar's pose, shape (4, 4).

@@ -40,6 +40,8 @@ MAX_STEPS_OF_PART = 20
 """Steps that the solution of a part may try by itself. Its own parts may begin until they have tried `MAX_STEPS`."""
 HELD = 1e-6
 """Standard deviation of what is held meanwhile, rad or m."""
+POSE, LANDMARK, BIAS = map(ord, "xlb")
+TANGENT_SIZES = {POSE: 6, LANDMARK: 3, BIAS: BIASES}
 
 
 class Stack(Protocol):
@@ -364,24 +366,29 @@ class KeptCovariance:
         self._joint, self._asked, self._asked_before = None, set(), self._asked.intersection(lasting)
 
 
+def kind(key: int) -> int:
+    """Character of a variable's symbol, which GTSAM keeps in the highest byte of its key."""
+    return key >> 56
+
+
 def tangent_size(key: int) -> int:
     """Dimension of a variable: 6 of a pose, 11 of the biases, 3 of a point."""
-    return {ord("x"): 6, ord("b"): BIASES}.get(gtsam.symbolChr(key), 3)
+    return TANGENT_SIZES[kind(key)]
 
 
 def is_pose(key: int) -> bool:
     """True for a keyframe."""
-    return bool(gtsam.symbolChr(key) == ord("x"))
+    return kind(key) == POSE
 
 
 def is_landmark(key: int) -> bool:
     """True for a landmark."""
-    return bool(gtsam.symbolChr(key) == ord("l"))
+    return kind(key) == LANDMARK
 
 
 def is_bias(key: int) -> bool:
     """True for the biases of a stretch of time."""
-    return bool(gtsam.symbolChr(key) == ord("b"))
+    return kind(key) == BIAS
 
 
 def picked(values: gtsam.Values, keys: Iterable[int]) -> gtsam.Values:

@@ -86,11 +86,12 @@ class FixedLagWindow:
         self.lag_s = lag_s
         """Age (s) from which on variables left at the last update."""
         self.is_by_qr = False
-        self.isam = self._empty()
+        self._begin_empty()
 
-    def _empty(self) -> gtsam.IncrementalFixedLagSmoother:
+    def _begin_empty(self) -> None:
         params = isam2_params(self._threshold, is_by_qr=self.is_by_qr)
-        return gtsam.IncrementalFixedLagSmoother(self.lag_s, params)
+        self.isam = gtsam.IncrementalFixedLagSmoother(self.lag_s, params)
+        self._theta = self.isam.getLinearizationPoint()  # held as in `SubmapWindow`
 
     def begin(
         self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, times_s: Mapping[Any, float], time_s: float
@@ -105,7 +106,7 @@ class FixedLagWindow:
         try:
             for factor in marginal(outside, values, kept_s, is_by_qr=self.is_by_qr) if outside.size() else ():
                 inside.add(factor)
-            self.isam = self._empty()
+            self._begin_empty()
             self.isam.update(inside, picked(values, kept_s), kept_s)
         except RuntimeError:
             if self.is_by_qr:
@@ -139,7 +140,7 @@ class FixedLagWindow:
     @property
     def linearised_at(self) -> gtsam.Values:
         """Where the variables are linearised."""
-        return self.isam.getLinearizationPoint()
+        return self._theta
 
     def estimate(self) -> gtsam.Values:
         """Estimate of the variables in the window."""

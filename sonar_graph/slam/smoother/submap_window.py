@@ -36,15 +36,12 @@ MOST_BENT = 0.1
 """Second-order term of a whitened sighting, over one sigma of its landmark's height: beyond it no submap is made."""
 
 
-def bending(sighting: gtsam.NoiseModelFactor, values: gtsam.Values, landmark: int, sigma_m: float) -> float:
-    """Second-order term of a whitened error, ``|e(l + sigma up) - 2 e(l) + e(l - sigma up)| / 2``."""
-    moved, errors = picked(values, sighting.keys()), []
-    for z_m in (-sigma_m, 0.0, sigma_m):
-        moved.update(landmark, values.atPoint3(landmark) + np.array([0.0, 0.0, z_m]))
-        errors.append(sighting.unwhitenedError(moved))
+def bending(sighting: gtsam.NoiseModelFactor, lower: gtsam.Values, values: gtsam.Values, higher: gtsam.Values) -> float:
+    """Second-order term of a whitened error, ``|e(l - sigma up) - 2 e(l) + e(l + sigma up)| / 2``."""
+    below, at, above = map(sighting.unwhitenedError, (lower, values, higher))
     noise = sighting.noiseModel()
     white = noise.noise() if isinstance(noise, gtsam.noiseModel.Robust) else noise
-    return 0.5 * float(np.linalg.norm(white.whiten(errors[0] - 2 * errors[1] + errors[2])))
+    return 0.5 * float(np.linalg.norm(white.whiten(below - 2.0 * at + above)))
 
 
 class SubmapWindow:
@@ -61,6 +58,8 @@ class SubmapWindow:
 
     def _begin_empty(self) -> None:
         self._isam = gtsam.ISAM2(isam2_params(self._threshold, is_by_qr=self.is_by_qr))
+        # a reference: as long as it is held GTSAM hands factors in Python this object, else a copy of all values each
+        self._theta = self._isam.getLinearizationPoint()
         self._slots: dict[Factor, int] = {}
         self._gone: list[int] = []
         self._marginals: dict[Factor, None] = {}
@@ -88,7 +87,7 @@ class SubmapWindow:
     @property
     def linearised_at(self) -> gtsam.Values:
         """Where the variables are linearised."""
-        return self._isam.getLinearizationPoint()
+        return self._theta
 
     def estimate(self) -> gtsam.Values:
         """Estimate of the variables in the window."""
@@ -281,7 +280,13 @@ class SubmapWindow:
                 self._height_sigmas_m[key] = math.sqrt(max(0.0, variance))
         elif not self._height_sigmas_m.keys() >= set(seen):
             return True
-        return any(not bending(f, estimate, key, self._height_sigmas_m[key]) <= MOST_BENT for f, key in sightings)
+        at = picked(estimate, {key for factor, _ in sightings for key in list(factor.keys())})
+        lower, higher = gtsam.Values(at), gtsam.Values(at)
+        for key in seen:
+            sigma_m = np.array([0.0, 0.0, self._height_sigmas_m[key]])
+            lower.update(key, at.atPoint3(key) - sigma_m)
+            higher.update(key, at.atPoint3(key) + sigma_m)
+        return any(not bending(factor, lower, at, higher) <= MOST_BENT for factor, _ in sightings)
 
     def _add(
         self, interior: list[int], ends: tuple[int, int], parts: tuple[Submap, ...], estimate: gtsam.Values
