@@ -19,6 +19,7 @@ from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats
 from sonar_graph.slam.smoother.batch_solution import tangent_size
 from sonar_graph.slam.smoother.factor_store import FactorStore
+from sonar_graph.slam.smoother.submaps import BLAS
 
 Labelled = tuple[str, gtsam.NonlinearFactor]
 MARGINAL = "marginal of what left the window"
@@ -79,7 +80,8 @@ def left_open(
         return []
     lengths = np.linalg.norm(A, axis=0)
     scale = 1.0 / np.where(lengths > 0, lengths, 1.0)
-    _, s, V = np.linalg.svd(A * scale, full_matrices=True)
+    with BLAS.limit(limits=1, user_api="blas"):
+        _, s, V = np.linalg.svd(np.linalg.qr(A * scale, mode="r"), full_matrices=True)
     rank = int(np.sum(s > RANK_LIMIT * max(s[0], 1e-300)))
     null = V[rank:] * scale
     null /= np.maximum(np.linalg.norm(null, axis=1, keepdims=True), 1e-300)
