@@ -9,7 +9,7 @@ against anything else, is `sonar_graph.sonar.evidence`. Derivation: docs/theory/
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -26,9 +26,9 @@ from sonar_graph.sonar.regions import Candidates
 from sonar_graph.sonar.templates import Floats32, Patch, PolarGrid, Templates
 
 COARSE = 2
-"""Cells between the shifts from which the search climbs to the best one."""
+"""Cells between the places from which the search climbs to the best one."""
 MOST_MULTIPLICATIONS = 250_000
-"""OpenBLAS uses several cores from 262,144 on."""
+"""OpenBLAS uses several cores from 262,144 on; threads that wait cost more than so small a product."""
 
 
 class AppearanceParams(Section):
@@ -62,136 +62,170 @@ class DesignFit:
     """(x, y) of each design's centre on the floor, between the grid's points, shape (designs, 2)."""
 
 
+class Search(NamedTuple):
+    """Templates whose best place in a patch is searched for."""
+
+    cells: Ints
+    """Cells that are compared, in a patch row by row, with the templates at their first place, shape (cells,)."""
+    pictures: Floats32
+    """The templates there, shape (templates, cells)."""
+    squares: Floats32
+    """Their squares, shape (templates, cells)."""
+    sums: Floats32
+    """Sums of both, shape (2, templates)."""
+    first: Ints
+    """First template of each design, and their number, shape (designs + 1,)."""
+    row: Ints
+    """Number of each place, one a cell along x and y; first those from which the search climbs. Shape (n, n)."""
+
+
 class Appearance:
     """Comparison of patches with the templates of designs."""
 
     def __init__(self, designs: Sequence[LandmarkDesign], params: AppearanceParams | None = None) -> None:
         self.params = params or AppearanceParams()
-        self.templates = Templates.of(designs, self.params.cell_m, self.params.margin_m, self.params.blur_m)
+        self.templates = templates = Templates.of(designs, self.params.cell_m, self.params.margin_m, self.params.blur_m)
         self.designs = len(designs)
-        self.figures = Figures(designs, self.templates, self.params.blur_m)
         self._steps = math.ceil(self.params.search_m / self.params.cell_m)
-        self.patch_side = 2 * (self.figures.half + self._steps) + 1
-        self._rim = self.figures.half - self.templates.side // 2
-        x, y = np.divmod(self.templates.cells, self.templates.side)
-        steps = np.arange(0, 2 * self._steps + 1, COARSE)
-        self._shifts = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
-        self._cells = (x + self._rim) * self.patch_side + y + self._rim
-        self._offsets = self._shifts @ np.array([self.patch_side, 1])
-        pictures = self.templates.pictures
-        self._pictures, self._squares = np.ascontiguousarray(pictures.T), np.ascontiguousarray(pictures.T**2)
-        self._sums = self._pictures.sum(axis=0), self._squares.sum(axis=0)
-        self._first_of_design = np.searchsorted(self.templates.design, np.arange(self.designs + 1)).tolist()
+        self.figures = Figures.of(designs, templates, self.params.blur_m, 2 * self._steps)
+        self.patch_side = self.figures.patch_side
+        self._rim = (self.patch_side - templates.side) // 2 - self._steps
+        x, y = np.divmod(templates.cells, templates.side)
+        pictures = templates.pictures
+        self._search = Search(
+            (x + self._rim) * self.patch_side + y + self._rim,
+            pictures,
+            pictures**2,
+            np.stack([pictures.sum(axis=1), (pictures**2).sum(axis=1)]),
+            np.searchsorted(templates.design, np.arange(self.designs + 1)),
+            numbered_places(2 * self._steps + 1),
+        )
 
     def fit(self, patch: Patch) -> DesignFit | None:
         """Fit of the designs, each at its best heading and shift; None where too little is in view."""
-        seen = windows(patch.seen.ravel(), self._cells, self._offsets)
-        visible = seen.sum(axis=1) / np.float32(len(self._cells))
-        at = self._correlations(patch, seen, visible)
-        share = float(visible[int(np.argmax(at)) // at.shape[1]])
-        if share < self.params.least_visible:
+        params, search, template = self.params, self._search, self._search.first[:-1].copy()
+        cell, top = np.zeros((self.designs, 2), np.int64), np.zeros((self.designs, 2))
+        visible = find_places(
+            patch.level_db.ravel(), patch.seen.ravel(), self.patch_side,
+            search.cells, search.pictures, search.squares, search.sums, search.first, search.row,
+            params.least_searched, template, cell, top,
+        )  # fmt: skip
+        if visible < params.least_visible or (evidence := self.figures.evidence(patch, template, cell)) is None:
             return None
-        level = centred(patch)
-        evidence, headings, centres = [], [], []
-        for first, last in pairwise(self._first_of_design):
-            shift, template = divmod(int(np.argmax(at[:, first:last])), last - first)
-            start, picture = self._shifts[shift], self.templates.pictures[first + template]
-            x, y, offset = climbed(level, patch.seen, self._cells, picture, start, 2 * self._steps)
-            found = self.figures.evidence(patch, first + template, (x, y))
-            if found is None:
-                return None
-            evidence.append(found)
-            headings.append(self.templates.heading_rad[first + template])
-            centres.append(patch.centre_m + self.params.cell_m * (np.array([x, y]) - self._steps + offset))
-        return DesignFit(np.array(evidence), share, np.array(headings), np.array(centres))
+        centre_m = patch.centre_m + params.cell_m * (top - self._steps)
+        return DesignFit(evidence, visible, self.templates.heading_rad[template], centre_m)
 
-    def _correlations(self, patch: Patch, seen: Floats32, visible: Floats32) -> Floats32:
-        """Correlation of each shift with each template, shape (shifts, templates); -1 where too little is visible."""
-        correlation = np.full((len(visible), self._pictures.shape[1]), -1.0, np.float32)
-        shifts = np.flatnonzero(visible >= self.params.least_searched)
-        if not len(shifts):
-            return correlation
-        n = (visible[shifts] * len(self._cells))[:, None]
-        level = windows(centred(patch).ravel(), self._cells, self._offsets[shifts])
-        total, square = (np.tile(whole, (len(shifts), 1)) for whole in self._sums)
-        cut = np.flatnonzero(visible[shifts] < 1)
-        if len(cut):
-            in_view = seen[shifts[cut]]
-            total[cut], square[cut] = matmul(in_view, self._pictures), matmul(in_view, self._squares)
-        level_sum, level_square = level.sum(axis=1)[:, None], np.einsum("sc,sc->s", level, level)[:, None]
-        covariance = matmul(level, self._pictures) - level_sum * total / n
-        scale2 = np.maximum(square - total**2 / n, 0.0) * np.maximum(level_square - level_sum**2 / n, 0.0)
-        known = scale2 > 0
-        correlation[shifts] = np.where(known, covariance / np.sqrt(np.where(known, scale2, 1.0)), -1.0)
-        return correlation
+
+def numbered_places(side: int) -> Ints:
+    """`Search.row` of so many places along each axis."""
+    is_start = np.arange(side) % COARSE == 0
+    order = np.argsort(~(is_start[:, None] & is_start), axis=None, kind="stable")
+    return np.argsort(order).reshape(side, side)
 
 
 @compiled
-def windows(values: Floats32, cells: Ints, offsets: Ints) -> Floats32:
-    """Values of a patch in the cells at each offset, shape (offsets, cells)."""
-    found = np.empty((len(offsets), len(cells)), np.float32)
-    for n in range(len(offsets)):
-        for c in range(len(cells)):
-            found[n, c] = values[cells[c] + offsets[n]]
-    return found
+def find_places(
+    level_db: Floats32, seen: Floats32, side: int, cells: Ints, pictures: Floats32, squares: Floats32, sums: Floats32,
+    first: Ints, row_of: Ints, least_searched: float, template: Ints, cell: Ints, top: Floats,
+) -> float:  # fmt: skip
+    """Fill in which template of each design correlates best with a patch, at which cell, and the top beside it.
 
-
-def matmul(rows: Floats32, columns: Floats32) -> Floats32:
-    """Matrix product in pieces that BLAS takes on one core: threads that wait cost more than so small a product."""
-    step = max(1, MOST_MULTIPLICATIONS // columns.size)
-    product = np.empty((len(rows), columns.shape[1]), np.float32)
-    for first in range(0, len(rows), step):
-        np.matmul(rows[first : first + step], columns, out=product[first : first + step])
-    return product
-
-
-def centred(patch: Patch) -> Floats32:
-    """Levels over their mean, 0 where nothing is seen: sums of small numbers are exact enough in 32 bits."""
-    return np.asarray((patch.level_db - patch.level_db.sum() / max(patch.seen.sum(), 1.0)) * patch.seen)
-
-
-@compiled
-def climbed(
-    level: Floats32, seen: Floats32, cells: Ints, picture: Floats32, start: Ints, last: int
-) -> tuple[int, int, Floats]:
-    """Shift in x and y at which a template correlates best, uphill from a start, and the top of the parabola there.
-
-    Shifts lie between 0 and ``last``; the top is an offset of at most one half along each axis, 0 at an end.
+    A patch comes row by row, each ``side`` cells; templates as in `Search`. At first templates are the first of their
+    designs, and places 0. The share of the cells in view at the best place of all before the climb.
     """
-    side, levels, seens = level.shape[1], level.ravel(), seen.ravel()
-    known = np.full((last + 1, last + 1), np.nan)
-    x, y, moved = start[0], start[1], True
-    while moved:
-        moved = False
-        for dx, dy in ((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)):
-            i, j = x + dx, y + dy
-            if 0 <= i <= last and 0 <= j <= last and np.isnan(known[i, j]):
-                known[i, j] = correlation(levels, seens, cells, i * side + j, picture)
-        for dx, dy in ((-1, 0), (1, 0), (0, -1), (0, 1)):
-            i, j = x + dx, y + dy
-            if 0 <= i <= last and 0 <= j <= last and known[i, j] > known[x, y]:
-                x, y, moved = i, j, True
-                break
-    offset = np.zeros(2)
-    if 0 < x < last:
-        offset[0] = parabola_top(known[x - 1, y], known[x, y], known[x + 1, y])
-    if 0 < y < last:
-        offset[1] = parabola_top(known[x, y - 1], known[x, y], known[x, y + 1])
-    return x, y, offset
+    places, is_cut, total, count = len(row_of), False, 0.0, 0.0
+    for at in range(len(seen)):
+        total, count, is_cut = total + level_db[at], count + seen[at], is_cut or seen[at] < 1
+    levels, mean = np.empty(len(seen), np.float32), np.float32(total / max(count, 1.0))
+    for at in range(len(seen)):
+        levels[at] = (level_db[at] - mean) * seen[at]
+    # what lies under the templates, at the places where they are laid
+    level, held = (
+        np.empty((places * places, len(cells)), np.float32),
+        np.empty((places * places, len(cells)), np.float32),
+    )
+    of_level = np.zeros((places * places, 3), np.float32)
+    for x in range(0, places, COARSE):
+        for y in range(0, places, COARSE):
+            row = row_of[x, y]
+            lay(levels, seen, cells, x * side + y, is_cut, level[row], held[row], of_level[row])
+    rows, step = ((places + COARSE - 1) // COARSE) ** 2, max(1, MOST_MULTIPLICATIONS // pictures.size)
+    found = np.empty((rows, len(pictures)), np.float32)
+    for begin in range(0, rows, step):
+        end = min(begin + step, rows)
+        ab, b, bb = np.dot(level[begin:end], pictures.T), sums[:1], sums[1:]
+        if is_cut:
+            b, bb = np.dot(held[begin:end], pictures.T), np.dot(held[begin:end], squares.T)
+        for row in range(begin, end):
+            w = row - begin
+            for t in range(len(pictures)):
+                found[row, t] = correlation(of_level[row], b[w % len(b), t], bb[w % len(b), t], ab[w, t])
+    best, highest, visible = np.full(len(template), -1.0), -1.0, 0.0
+    for x in range(0, places, COARSE):
+        for y in range(0, places, COARSE):
+            row = row_of[x, y]
+            if of_level[row, 0] < least_searched * len(cells):
+                continue
+            for k in range(len(template)):
+                for t in range(first[k], first[k + 1]):
+                    if found[row, t] > best[k]:
+                        best[k], template[k], cell[k, 0], cell[k, 1] = found[row, t], t, x, y
+                if best[k] > highest:
+                    highest, visible = best[k], of_level[row, 0] / len(cells)
+    # uphill from there
+    for k in range(len(template)):
+        x, y, moved, known = cell[k, 0], cell[k, 1], True, np.full(row_of.shape, np.nan)
+        picture, square, b_k, bb_k = (
+            pictures[template[k]],
+            squares[template[k]],
+            sums[0, template[k]],
+            sums[1, template[k]],
+        )
+        while moved:
+            moved = False
+            for dx, dy in ((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)):
+                i, j = x + dx, y + dy
+                if not (0 <= i < places and 0 <= j < places and np.isnan(known[i, j])):
+                    continue
+                row = row_of[i, j]
+                if of_level[row, 0] == 0:
+                    lay(levels, seen, cells, i * side + j, is_cut, level[row], held[row], of_level[row])
+                if is_cut:
+                    b_k, bb_k = np.dot(held[row], picture), np.dot(held[row], square)
+                known[i, j] = correlation(of_level[row], b_k, bb_k, np.dot(level[row], picture))
+            for dx, dy in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+                i, j = x + dx, y + dy
+                if 0 <= i < places and 0 <= j < places and known[i, j] > known[x, y]:
+                    x, y, moved = i, j, True
+                    break
+        cell[k, 0], cell[k, 1], top[k, 0], top[k, 1] = x, y, x, y
+        if 0 < x < places - 1:
+            top[k, 0] += parabola_top(known[x - 1, y], known[x, y], known[x + 1, y])
+        if 0 < y < places - 1:
+            top[k, 1] += parabola_top(known[x, y - 1], known[x, y], known[x, y + 1])
+    return visible
 
 
 @compiled
-def correlation(level: Floats32, seen: Floats32, cells: Ints, offset: int, picture: Floats32) -> float:
-    """Correlation of a template with the seen cells of a patch, whose levels are 0 elsewhere."""
-    zero = np.float32(0.0)
-    n, a, b, aa, bb, ab = zero, zero, zero, zero, zero, zero
+def lay(
+    levels: Floats32, seen: Floats32, cells: Ints, shift: int, is_cut: bool,
+    level: Floats32, held: Floats32, sums: Floats32,
+) -> None:  # fmt: skip
+    """Fill in levels, and whether they are seen, in cells so far on; their number, sum and sum of squares."""
     for c in range(len(cells)):
-        at = np.uint32(cells[c] + offset)
-        one, held, other = level[at], seen[at], picture[c]
-        n, a, b = n + held, a + one, b + held * other
-        aa, bb, ab = aa + one * one, bb + held * other * other, ab + one * other
+        level[c], held[c] = levels[np.uint32(cells[c] + shift)], 1.0
+    if is_cut:
+        for c in range(len(cells)):
+            held[c] = seen[np.uint32(cells[c] + shift)]
+    sums[0], sums[1], sums[2] = np.dot(held, held), np.dot(held, level), np.dot(level, level)
+
+
+@compiled
+def correlation(sums: Floats32, b: float, bb: float, ab: float) -> float:
+    """Correlation from `lay`'s sums, sums over a template and its squares, and over both; -1 where one is flat."""
+    n, a, aa = sums[0], sums[1], sums[2]
     scale2 = (n * aa - a * a) * (n * bb - b * b)
-    return float((n * ab - a * b) / math.sqrt(scale2)) if scale2 > 0 else -1.0
+    return (n * ab - a * b) / math.sqrt(scale2) if scale2 > 0 else -1.0
 
 
 @compiled
@@ -238,30 +272,31 @@ class CandidateFit:
         is_same = (one is other or np.array_equal(one, other) for one, other in zip(self._shape, shape, strict=True))
         if self._grid is None or not all(is_same):
             self._grid, self._shape = PolarGrid.of(*shape, self._aperture_rad), shape
-        return [
-            None
-            if row < 0
-            else self._sighting(image_db, view, float(candidates.range_m[row]), float(candidates.azimuth_rad[row]))
-            for row in rows.tolist()
-        ]
+        plane, seen = view or SLANT_PLANE, rows[rows >= 0]
+        range_m, azimuth_rad = candidates.range_m[seen], candidates.azimuth_rad[seen]
+        points_m = plane.floor_points(range_m, azimuth_rad) @ plane.level_R_sonar.T
+        columns = range_m.tolist(), azimuth_rad.tolist(), *points_m.T[:2].tolist()
+        sightings = iter([self._sighting(image_db, view, *row) for row in zip(*columns, strict=True)])
+        return [None if row < 0 else next(sightings) for row in rows.tolist()]
 
     def _sighting(
-        self, image_db: Floats32, view: FloorView | None, range_m: float, azimuth_rad: float
+        self, image_db: Floats32, view: FloorView | None, range_m: float, azimuth_rad: float, x_m: float, y_m: float
     ) -> ObjectSighting:
-        """Sighting of a candidate with its centroid at a range and azimuth: where the best design's centre is."""
+        """Sighting of a candidate with its centroid at a range and azimuth and a floor point, level x and y.
+
+        Where the best design's centre is; NaN for the floor point: the ray does not reach it.
+        """
         assert self._grid is not None
-        plane, model, appearance = view or SLANT_PLANE, self._confusion, self._appearance
-        centroid = ObjectSighting(
-            None, range_m, azimuth_rad, np.diag(np.square([CENTROID_SIGMA_M, CENTROID_SIGMA_M / range_m]))
-        )
-        centre = plane.floor_point(range_m, azimuth_rad)
-        if centre is None:
-            return centroid
-        ahead = plane.turned(math.atan2(centre[1], centre[0]))
-        at = np.array([np.hypot(*centre), 0.0])
-        fit = appearance.fit(self._grid.patch(image_db, ahead, at, appearance.patch_side, appearance.params.cell_m))
+        model, params, fit = self._confusion, self._appearance.params, None
+        if not math.isnan(x_m):
+            ahead = (view or SLANT_PLANE).turned(math.atan2(y_m, x_m))
+            centre_m = np.array([math.hypot(x_m, y_m), 0.0])
+            fit = self._appearance.fit(
+                self._grid.patch(image_db, ahead, centre_m, self._appearance.patch_side, params.cell_m)
+            )
         if fit is None:
-            return centroid
+            covariance = np.diag(np.square([CENTROID_SIGMA_M, CENTROID_SIGMA_M / range_m]))
+            return ObjectSighting(None, range_m, azimuth_rad, covariance)
         best = int(np.argmax(model.log_odds(fit.evidence)))
         range_m, azimuth_rad = ahead.range_azimuth(fit.centre_m[best])
         rise = 0.0 if view is None else view.height_m / range_m
@@ -274,7 +309,8 @@ class CandidateFit:
         Of a track that ends looking like this; rows of NaN where nothing was compared.
         """
         odds = np.full((len(sightings), self._appearance.designs + 1), np.nan)
-        for row, sighting in enumerate(sightings):
-            if sighting is not None and sighting.fit is not None:
-                odds[row] = np.append(self._confusion.log_odds(sighting.fit.evidence), 0.0)
+        fits = {row: one.fit for row, one in enumerate(sightings) if one is not None and one.fit is not None}
+        if fits:
+            odds[[*fits], :-1] = self._confusion.log_odds(np.array([fit.evidence for fit in fits.values()]))
+            odds[[*fits], -1] = 0.0
         return odds

@@ -19,17 +19,18 @@ frame, its independent share 0 <= w <= 1 (`news_of_motion`), and the sums over t
 Comparison of both rules, and sources: docs/theory/recognition.md.
 """
 
-from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from sonar_graph.calibration import Section
-from sonar_graph.measurements import Floats
+from sonar_graph.measurements import Floats, Ints
 from sonar_graph.sonar.confusion import Confusion, soft_scores
 from sonar_graph.sonar.track_filter import Association
 
+Bools = NDArray[np.bool_]
 Rule = Literal["virtual-evidence", "jeffrey"]
 
 
@@ -124,48 +125,51 @@ class Beliefs:
         self._counted = np.empty(0)
         self.weights: Floats = np.empty(0)
         """Independent share of the last frame for each track, shape (M,)."""
-        self._looks: dict[int, list[Floats]] = {}
+        self._looked: Ints = np.empty(0, dtype=np.int64)
+        self._places = np.empty((0, 3))
 
     def step(
-        self, association: Association, log_odds: Floats, places: Sequence[Floats | None], sideways: Floats
+        self, association: Association, log_odds: Floats, is_looked: Bools, place: Floats, sideways: Floats
     ) -> Floats:
         """Predict and update for one frame; the beliefs after it, shape (M, K).
 
-        Log odds of the classes, shape (M, K), the last one's 0. Where a track was looked at, ``places`` has the
-        position of the sonar in a fixed frame, shape (3,), else None; ``sideways`` is the horizontal unit vector across
-        each line of sight in the same frame, shape (M, 3).
+        Log odds of the classes, shape (M, K), the last one's 0, of the tracks that were looked at, shape (M,).
+        ``place`` is the position of the sonar in a fixed frame, shape (3,), and ``sideways`` the horizontal unit vector
+        across each line of sight in the same frame, shape (M, 3).
         """
         rows = [self._order.index(track) for track in association.previous_ids.tolist()]
         self._order = association.ids.tolist()
-        self.weights = np.array([self._weight(*look) for look in zip(self._order, places, sideways, strict=True)])
+        news = np.ones(len(is_looked))
+        if self.params.rule != "jeffrey":
+            news = self._news(association.ids, place, sideways)
+        self.weights = np.where(is_looked & (news >= self.params.least_news), news, 0.0)
         known = np.where(self.weights[:, None] > 0, log_odds, 0.0)
-        self._looks = {track: looks for track, looks in self._looks.items() if track in self._order}
         if self.params.rule == "jeffrey":
             predicted = predict(self._beliefs[rows], association.matrix, self._birth, self.params.forgetting)
             scores = np.where(self.weights[:, None] > 0, soft_scores(known, self._model.looks), 0.0)
             self._beliefs = jeffrey(predicted, scores, self._model.array())
             return self._beliefs
+        self._remember(association.ids[self.weights > 0], place)
         carried = association.matrix[:, :-1]
         self._log_odds = carried @ self._log_odds[rows] + self.weights[:, None] * known
         self._counted = carried @ self._counted[rows] + self.weights
         return bounded_evidence(self._birth, self._log_odds, self._counted, self._model.looks, self._model.doubt)
 
-    def _weight(self, track: int, place: Floats | None, sideways: Floats) -> float:
-        """Independent share of a look; 0: left out. Remembers the place of one that counts."""
-        if place is None:
-            return 0.0
-        if self.params.rule == "jeffrey":
-            return 1.0
-        looks = self._looks.setdefault(track, [])
-        news = 1.0
-        if looks:
-            moved = place - np.array(looks)
-            aside = moved @ sideways
-            ahead = np.sqrt(np.maximum(np.sum(moved**2, axis=1) - aside**2, 0.0))
-            nearest = np.hypot(aside, ahead / self.params.ahead_ratio).min()
-            news = float(news_of_motion(nearest, self.params.aperture_m))
-        if news < self.params.least_news:
-            return 0.0
-        looks.append(place)
-        del looks[: -self.params.most_looks]
-        return news
+    def _news(self, ids: Ints, place: Floats, sideways: Floats) -> Floats:
+        """Independent share of a look from here at each track, shape (M,); places of other tracks are forgotten."""
+        look, row = np.nonzero(self._looked[:, None] == ids)
+        self._looked, self._places = self._looked[look], self._places[look]
+        moved = place - self._places
+        aside = np.vecdot(moved, sideways[row])
+        ahead = np.sqrt(np.maximum(np.vecdot(moved, moved) - aside**2, 0.0))
+        nearest = np.full(len(ids), np.inf)
+        np.minimum.at(nearest, row, np.hypot(aside, ahead / self.params.ahead_ratio))
+        return news_of_motion(nearest, self.params.aperture_m)
+
+    def _remember(self, ids: Ints, place: Floats) -> None:
+        """Remember the place from which tracks were looked at; of too many of a track the first is forgotten."""
+        self._looked = np.append(self._looked, ids)
+        self._places = np.vstack([self._places, np.tile(place, (len(ids), 1))])
+        _, first, count = np.unique(self._looked, return_index=True, return_counts=True)
+        if (too_many := first[count > self.params.most_looks]).size:
+            self._looked, self._places = np.delete(self._looked, too_many), np.delete(self._places, too_many, axis=0)

@@ -150,16 +150,23 @@ def false_alarm_offset_db(spread_db: float, false_alarm: float) -> float:
     return float(DB_PER_NEPER * (np.log(gammainccinv(looks, false_alarm)) - digamma(looks)))
 
 
+SPREADS_DB = np.linspace(0.05, 12.0, 240)
+"""Spreads of which offsets are tabled."""
+
+
 @lru_cache(maxsize=16)
-def offset_table(false_alarm: float) -> tuple[Floats, Floats]:
-    """Spreads and their offsets, for interpolation."""
-    spreads = np.linspace(0.05, 12.0, 240)
-    return spreads, np.array([false_alarm_offset_db(spread, false_alarm) for spread in spreads])
+def offset_table(false_alarm: float) -> Floats32:
+    """Offsets of `SPREADS_DB`, for interpolation."""
+    return np.array([false_alarm_offset_db(spread, false_alarm) for spread in SPREADS_DB.tolist()], np.float32)
 
 
 def false_alarm_offsets_db(spreads_db: Floats32, false_alarm: float) -> Floats32:
     """`false_alarm_offset_db` of each, by interpolation to 0.01 dB."""
-    return np.interp(spreads_db, *offset_table(false_alarm)).astype(np.float32)
+    table, first, step = offset_table(false_alarm), np.float32(SPREADS_DB[0]), np.float32(SPREADS_DB[1] - SPREADS_DB[0])
+    place = np.clip((spreads_db - first) / step, 0, len(table) - 1)
+    row = np.minimum(place.astype(np.int32), len(table) - 2)
+    before = table[row]
+    return before + (place - row).astype(np.float32) * (table[row + 1] - before)
 
 
 LEAST_COUNT = 3

@@ -13,18 +13,22 @@ columns of `Figures.evidence`. How much each counts is measured (`Confusion.weig
 docs/theory/recognition.md.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from sonar_graph.devices import LandmarkDesign
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.numerics import compiled
 from sonar_graph.sonar.templates import Floats32, Patch, Templates, drawn, material_radius_m
 
+Bools = NDArray[np.bool_]
 EVIDENCE = ("prior", "outline", "figure", "contrast", "beyond", "floor", "behind", "plate", "bare")
 """prior: 1; outline: ln R(otherwise) / R(design); figure: the same without S and D; contrast: ln beta / sigma; beyond:
 ln mean square of what is brighter than the design says, next to the figure; floor: ln mean square of what is darker,
@@ -52,98 +56,164 @@ NEAR, BEHIND, FAR = 1, 2, 4
 """Zones of the floor; a cell may lie in more than one."""
 
 
-class Figures:
-    """The models of a patch for each template."""
+class Figures(NamedTuple):
+    """The models of a patch for each template, over the cells that are compared.
 
-    def __init__(self, designs: Sequence[LandmarkDesign], templates: Templates, blur_m: float) -> None:
-        self.cell_m, material_m = templates.cell_m, max(map(material_radius_m, designs))
-        self.half = math.ceil((material_m + SHADOW_M) / self.cell_m)
-        side = 2 * self.half + 1
-        places_m = self.cell_m * np.arange(-self.half, self.half + 1)
-        x_m, y_m = np.meshgrid(places_m, places_m, indexing="ij")
+    Rows are cells, those of one template after those of another, n in all.
+    """
+
+    patch_side: int
+    """Cells along the side of the patches, in which the models may be shifted."""
+    first: Ints
+    """First row of each template, and n, shape (templates + 1,)."""
+    cells: Ints
+    """Cells of a patch, row by row, with the template at its first place, shape (n,)."""
+    values: Floats32
+    """1, D, the figures B_q, and S_q behind them, shape (n, 2 + 2 figures)."""
+    smooth: Floats32
+    """D and B over 3 by 3 cells, shape (n, 2)."""
+    zones: Ints
+    """Sums of `FAR`, `NEAR` and `BEHIND`, shape (n,)."""
+    gram: Floats
+    """``values^T values`` of each template, shape (templates, 2 + 2 figures, 2 + 2 figures)."""
+    has_dark: Bools
+    """Whether it has dark parts, shape (templates,)."""
+
+    @classmethod
+    def of(cls, designs: Sequence[LandmarkDesign], templates: Templates, blur_m: float, last: int) -> Figures:
+        """Models of designs at the headings of their templates, for places 0 to ``last`` along each axis."""
+        cell_m, material_m = templates.cell_m, max(map(material_radius_m, designs))
+        half = math.ceil((material_m + SHADOW_M) / cell_m)
+        side = 2 * half + 1
+        x_m, y_m = np.meshgrid(*2 * [cell_m * np.arange(-half, half + 1)], indexing="ij")
         away_m = np.hypot(x_m, y_m)
         area = (away_m <= material_m + REACH_M) | ((away_m <= material_m + SHADOW_M) & (x_m > 0.5 * away_m))
-        self._designs: list[_Design] = []
         kernel = np.ones((2 * NEAR_CELLS + 1, 2 * NEAR_CELLS + 1), np.uint8)
+        columns = []
         for index, heading in zip(templates.design.tolist(), templates.heading_rad.tolist(), strict=True):
             design = designs[index]
-            parts = [drawn(design, heading, side, self.cell_m, blur_m, stretch) for stretch in STRETCHES]
+            parts = [drawn(design, heading, side, cell_m, blur_m, stretch) for stretch in STRETCHES]
             figures = [bright / float(np.nanmax(design.mask)) for bright, _ in parts]
             figure, dark = figures[0], parts[0][1] / min(float(np.nanmin(design.mask)), -1.0)
-            is_plate = dark > PART
+            has_dark = bool((dark > PART).any())
             own_shadow = behind(np.minimum(figure + dark, 1.0), OWN_SHADOW_CELLS) > PART
-            compared = area & ~(own_shadow & ((away_m > material_m) | (not is_plate.any())))
+            compared = area & ~(own_shadow & ((away_m > material_m) | (not has_dark)))
             is_out = (figure < OUT) & compared
             is_near = cv2.dilate((figure > PART).astype(np.uint8), kernel) > 0
             zones = NEAR * (is_out & is_near) + BEHIND * (is_out & (behind(figure, BEHIND_CELLS) > PART))
             zones += FAR * (is_out & ~is_near & (dark < OUT))
             shades = [behind(one, SHADOW_CELLS) for one in figures]
-            cells = np.flatnonzero(compared)
-            columns = np.stack([np.ones_like(figure), dark, *figures, *shades]).reshape(-1, side * side)[:, cells]
-            columns = np.ascontiguousarray(columns, np.float32)
-            smooth = np.stack([cv2.blur(dark, (3, 3)), cv2.blur(figure, (3, 3))]).reshape(2, -1)[:, cells]
-            rows, beside = np.divmod(cells, side)
-            self._designs.append(
-                _Design(
-                    rows,
-                    beside,
-                    columns,
-                    np.asarray(smooth, np.float32),
-                    zones.ravel()[cells],
-                    columns @ columns.T,
-                    bool(is_plate.any()),
-                )
-            )
+            values = np.stack([np.ones_like(figure), dark, *figures, *shades])[:, compared].T.astype(np.float32)
+            smooth = np.stack([cv2.blur(dark, (3, 3)), cv2.blur(figure, (3, 3))])[:, compared].T.astype(np.float32)
+            gram = values.T.astype(float) @ values
+            x, y = np.nonzero(compared)
+            columns.append((x * (side + last) + y, values, smooth, zones[compared], gram, has_dark))
+        *rows, grams, darks = zip(*columns, strict=True)
+        first = np.cumsum([0, *map(len, rows[0])])
+        cells, values, smooth, zones = (np.ascontiguousarray(np.concatenate(of)) for of in rows)
+        return cls(side + last, first, cells, values, smooth, zones, np.array(grams), np.array(darks))
 
-    def evidence(self, patch: Patch, template: int, first: tuple[int, int]) -> Floats | None:
-        """`EVIDENCE` of a template on the part of a patch that begins at this cell, shape (9,).
+    def evidence(self, patch: Patch, template: Ints, cell: Ints) -> Floats | None:
+        """`EVIDENCE` of templates on the parts of a patch that begin at some cells, shapes (n,), (n, 2), (n, 9).
 
-        None where too little of it is in view, or where it has one level.
+        None where too little of one is in view, or where it has one level.
         """
-        one, side = self._designs[template], len(patch.level_db)
-        at = (one.rows + first[0]) * side + one.aside + first[1]
-        seen, smooth = patch.seen.ravel()[at], patch.smooth_db.ravel()[at]
-        count = float(seen.sum())
-        if count < LEAST_CELLS:
-            return None
-        level = patch.level_db.ravel()[at]
-        mean = float(level @ seen) / count
-        level = (level - mean) * seen
-        values, gram = one.values, one.gram
-        if count < len(at):
-            values = values * seen
-            gram = values @ values.T
-        products, total = (values @ level).astype(float), float(level @ level)
-        if total < LEAST_VARIANCE_DB2 * count:
-            return None
-        return _evidence(
-            gram.astype(float), products, total, count, one.has_dark, smooth - np.float32(mean), patch.held.ravel()[at],
-            one.smooth, one.zones, level, seen,
+        found = np.empty((len(template), len(EVIDENCE)))
+        is_measured = fill_evidence(
+            patch.level_db.ravel(), patch.seen.ravel(), patch.smooth_db.ravel(), patch.held.ravel(), self.patch_side,
+            self.first, self.cells, self.values, self.smooth, self.zones, self.gram, self.has_dark,
+            template, cell, found,
         )  # fmt: skip
-
-
-class _Design(NamedTuple):
-    """One template over the cells that are compared, n of them."""
-
-    rows: Ints
-    """Cells ahead from the first, shape (n,)."""
-    aside: Ints
-    """Cells to the side, shape (n,)."""
-    values: Floats32
-    """1, D, the figures B_q, and S_q behind them, shape (2 + 2 figures, n)."""
-    smooth: Floats32
-    """D and B over 3 by 3 cells, shape (2, n)."""
-    zones: Ints
-    """Sums of `FAR`, `NEAR` and `BEHIND`, shape (n,)."""
-    gram: Floats32
-    """``values values^T``."""
-    has_dark: bool
+        return found if is_measured else None
 
 
 @compiled
-def residual(gram: Floats, products: Floats, total: float, at: Ints, solution: Floats) -> float:
-    """Sum of squares left by least squares on the columns ``at``; fills in their coefficients, by elimination."""
-    n = len(at)
+def fill_evidence(
+    level_db: Floats32, seen: Floats32, smooth_db: Floats32, held: Floats32, side: int,
+    first_of: Ints, all_cells: Ints, all_values: Floats32, all_smooth: Floats32, all_zones: Ints, grams: Floats,
+    has_dark: Bools, template: Ints, cell: Ints, found: Floats,
+) -> bool:  # fmt: skip
+    """Fill in `EVIDENCE` of templates on the parts of a patch that begin at some cells, shape (n, 9).
+
+    A patch comes row by row, each ``side`` cells; what is known of templates as in `Figures`. False where too little is
+    in view, or where it has one level.
+    """
+    for k in range(len(template)):
+        begin, end, shift = first_of[template[k]], first_of[template[k] + 1], cell[k, 0] * side + cell[k, 1]
+        cells, values, rows = all_cells[begin:end], all_values[begin:end], end - begin
+        smooth, zones = all_smooth[begin:end], all_zones[begin:end]
+        level, is_seen = np.empty((1, rows), np.float32), np.empty(rows, np.float32)
+        for n in range(rows):
+            level[0, n], is_seen[n] = level_db[cells[n] + shift], seen[cells[n] + shift]
+        count = float(np.dot(is_seen, is_seen))
+        if count < LEAST_CELLS:
+            return False
+        mean = np.float32(np.dot(level[0], is_seen) / count)
+        for n in range(rows):
+            level[0, n] = (level[0, n] - mean) * is_seen[n]
+        total = float(np.dot(level[0], level[0]))
+        if total < LEAST_VARIANCE_DB2 * count:
+            return False
+        # products of the columns with each other and with the levels
+        gram, products = grams[template[k]].copy(), np.dot(level, values)[0]
+        for n in range(rows):
+            if is_seen[n] == 0:
+                for i in range(len(gram)):
+                    for j in range(len(gram)):
+                        gram[i, j] -= values[n, i] * values[n, j]
+        c, dark, first, kinds = np.zeros(4), 1, 2, (len(products) - 2) // 2
+        # the design: with its dark parts where they are dark, with and without a shadow
+        plain, _ = least_squares(gram, products, total, np.array([0, first]), c)
+        design, floor, beta, delta = plain, c[0], c[1], 0.0
+        if has_dark[template[k]]:
+            with_dark, _ = least_squares(gram, products, total, np.array([0, first, dark]), c)
+            if c[2] < 0:
+                design, floor, beta, delta = with_dark, c[0], c[1], c[2]
+        shaded, _ = least_squares(gram, products, total, np.array([0, first, first + kinds]), c)
+        shaded = shaded if c[2] < 0 else plain
+        both = min(design, shaded)
+        if delta < 0 and shaded < plain:
+            with_both, _ = least_squares(gram, products, total, np.array([0, first, dark, first + kinds]), c)
+            both = with_both if c[2] < 0 and c[3] < 0 else both
+        # otherwise: the best of all figures
+        other, other_plain = shaded, plain
+        for q in range(first + 1, first + kinds):
+            shaded_q, plain_q = least_squares(gram, products, total, np.array([0, q, q + kinds]), c)
+            other_plain = min(other_plain, plain_q)
+            other = min(other, shaded_q if c[2] < 0 else plain_q)
+        # what is left next to the figure, farther out, and behind
+        mean_square = design / count
+        near, near_cells, far, far_cells, back, back_cells = 0.0, 0, 0.0, 0, 0.0, 0
+        for n in range(rows):
+            at = cells[n] + shift
+            if zones[n] == 0 or held[at] <= 0.5:
+                continue
+            off = smooth_db[at] - mean - floor - beta * smooth[n, 1] - delta * smooth[n, 0]
+            if zones[n] & NEAR:
+                near, near_cells = near + max(off, 0.0) ** 2, near_cells + 1
+            if zones[n] & FAR:
+                far, far_cells = far + min(off, 0.0) ** 2, far_cells + 1
+            if zones[n] & BEHIND and is_seen[n] > 0:
+                back, back_cells = back + level[0, n] - floor, back_cells + 1
+        found[k, 0] = 1.0
+        found[k, 1] = math.log(other / both)
+        found[k, 2] = math.log(other_plain / plain)
+        found[k, 3] = math.log(max(beta, LEAST_BETA_DB) / math.sqrt(mean_square))
+        found[k, 4] = math.log((near / near_cells if near_cells > 8 else mean_square / 3) + LEAST_DB2)
+        found[k, 5] = math.log((far / far_cells if far_cells > 8 else mean_square / 3) + LEAST_DB2)
+        found[k, 6] = back / back_cells if back_cells > 5 else 0.0
+        found[k, 7] = math.sqrt(max(math.log(shaded / both), 0.0))
+        found[k, 8] = 0.0 if has_dark[template[k]] else 1.0
+    return True
+
+
+@compiled
+def least_squares(gram: Floats, products: Floats32, total: float, at: Ints, c: Floats) -> tuple[float, float]:
+    """Sums of squares that the columns ``at`` leave, all of them and all but the last; fills in coefficients of all.
+
+    By elimination: with ``G = L D L^T`` and ``L y = products`` column i takes ``y_i^2 / D_i``.
+    """
+    n, left, before = len(at), total, total
     a = np.empty((n, n + 1))
     for i in range(n):
         for j in range(n):
@@ -151,73 +221,16 @@ def residual(gram: Floats, products: Floats, total: float, at: Ints, solution: F
         a[i, i] += 1e-3
         a[i, n] = products[at[i]]
     for i in range(n):
+        before, left = left, left - a[i, n] ** 2 / a[i, i]
         for k in range(i + 1, n):
             factor = a[k, i] / a[i, i]
             for j in range(i, n + 1):
                 a[k, j] -= factor * a[i, j]
-    left = total
     for i in range(n - 1, -1, -1):
-        value = a[i, n]
-        for j in range(i + 1, n):
-            value -= a[i, j] * solution[j]
-        solution[i] = value / a[i, i]
-    for i in range(n):
-        left -= solution[i] * products[at[i]]
-    return max(left, 1e-3)
-
-
-@compiled
-def _evidence(
-    gram: Floats, products: Floats, total: float, count: float, has_dark: bool, smooth: Floats32, held: Floats32,
-    model: Floats32, zones: Ints, level: Floats32, seen: Floats32,
-) -> Floats:  # fmt: skip
-    """`EVIDENCE` from products of columns with each other and with levels, which have the mean 0."""
-    dark, first, figures = 1, 2, (len(products) - 2) // 2
-    found, solution = np.empty(9), np.zeros(4)
-    # the design: with its dark parts where they are dark, with and without a shadow
-    plain = residual(gram, products, total, np.array([0, first]), solution)
-    floor, beta, delta = solution[0], solution[1], 0.0
-    design = plain
-    if has_dark:
-        with_dark = residual(gram, products, total, np.array([0, first, dark]), solution)
-        if solution[2] < 0:
-            design, floor, beta, delta = with_dark, solution[0], solution[1], solution[2]
-    shaded = residual(gram, products, total, np.array([0, first, first + figures]), solution)
-    shaded = shaded if solution[2] < 0 else plain
-    both = min(design, shaded)
-    if delta < 0 and shaded < plain:
-        with_both = residual(gram, products, total, np.array([0, first, dark, first + figures]), solution)
-        both = with_both if solution[2] < 0 and solution[3] < 0 else both
-    # otherwise: the best of all figures
-    other, other_plain = shaded, plain
-    for q in range(1, figures):
-        other_plain_q = residual(gram, products, total, np.array([0, first + q]), solution)
-        other_q = residual(gram, products, total, np.array([0, first + q, first + figures + q]), solution)
-        other_plain = min(other_plain, other_plain_q)
-        other = min(other, other_q if solution[2] < 0 else other_plain_q)
-    # what is left next to the figure, farther out, and behind
-    mean_square = design / count
-    near, near_cells, far, far_cells, back, back_cells = 0.0, 0, 0.0, 0, 0.0, 0
-    for c in range(len(zones)):
-        if held[c] <= 0.5:
-            continue
-        off = smooth[c] - floor - beta * model[1, c] - delta * model[0, c]
-        if zones[c] & NEAR:
-            near, near_cells = near + max(off, 0.0) ** 2, near_cells + 1
-        if zones[c] & FAR:
-            far, far_cells = far + min(off, 0.0) ** 2, far_cells + 1
-        if zones[c] & BEHIND and seen[c] > 0:
-            back, back_cells = back + level[c] - floor, back_cells + 1
-    found[0] = 1.0
-    found[1] = math.log(other / both)
-    found[2] = math.log(other_plain / plain)
-    found[3] = math.log(max(beta, LEAST_BETA_DB) / math.sqrt(mean_square))
-    found[4] = math.log((near / near_cells if near_cells > 8 else mean_square / 3) + LEAST_DB2)
-    found[5] = math.log((far / far_cells if far_cells > 8 else mean_square / 3) + LEAST_DB2)
-    found[6] = back / back_cells if back_cells > 5 else 0.0
-    found[7] = math.sqrt(max(math.log(shaded / both), 0.0))
-    found[8] = 0.0 if has_dark else 1.0
-    return found
+        c[i] = a[i, n] / a[i, i]
+        for k in range(i):
+            a[k, n] -= a[k, i] * c[i]
+    return max(left, 1e-3), max(before, 1e-3)
 
 
 def behind(figure: Floats32, cells: int) -> Floats32:

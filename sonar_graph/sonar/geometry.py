@@ -50,7 +50,7 @@ class FloorView:
     def __post_init__(self) -> None:
         if not self.height_m > 0:
             raise CalibrationError(f"FloorView.height_m: {self.height_m} m; the sonar must be above the floor")
-        if not np.hypot(*self.level_R_sonar[:2, 0]) > 1e-6:
+        if not math.hypot(self.level_R_sonar[0, 0], self.level_R_sonar[1, 0]) > 1e-6:
             raise CalibrationError("FloorView: the centre beam is vertical, so that level axes have no direction")
 
     @classmethod
@@ -68,8 +68,9 @@ class FloorView:
 
     def turned(self, bearing_rad: float) -> FloorView:
         """The same view with level axes whose x axis points to this bearing."""
-        level_R_ahead = gtsam.Rot3.Rz(bearing_rad).matrix()
-        return replace(self, level_R_sonar=level_R_ahead.T @ self.level_R_sonar)
+        cos, sin = math.cos(bearing_rad), math.sin(bearing_rad)
+        ahead_R_level = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        return replace(self, level_R_sonar=ahead_R_level @ self.level_R_sonar)
 
     def floor_points(self, ranges_m: Floats, azimuths_rad: Floats) -> Floats:
         """Points in the sonar frame where rays meet the floor, shape (n, 3); NaN where they do not."""
@@ -86,8 +87,8 @@ class FloorView:
 
     def range_azimuth(self, xy_m: Floats) -> tuple[float, float]:
         """Range and azimuth of a floor point, level (x, y) of shape (2,)."""
-        q = self.level_R_sonar.T @ np.array([xy_m[0], xy_m[1], -self.height_m])
-        return float(np.linalg.norm(q)), math.atan2(q[1], q[0])
+        x, y, z = (self.level_R_sonar.T @ np.array([xy_m[0], xy_m[1], -self.height_m])).tolist()
+        return math.hypot(x, y, z), math.atan2(y, x)
 
     def elevation_sigmas(self, points_m: Floats) -> Floats:
         """Standard deviation of the elevation of floor points, shape (n,), given in the sonar frame, shape (n, 3).

@@ -172,12 +172,12 @@ class Recogniser:
         self.track_ids = association.ids
         self.sightings = self._look.at(image_db, frame, view, candidates, association.candidate)
         log_odds = self._look.log_odds(self.sightings)
-        place = self._start_T_sonar.translation()
-        places = [None if sighting is None or sighting.fit is None else place for sighting in self.sightings]
+        is_looked = np.isfinite(log_odds[:, -1])
         azimuth = np.arctan2(association.position_m[:, 1], association.position_m[:, 0])
         across = np.column_stack([-np.sin(azimuth), np.cos(azimuth), np.zeros_like(azimuth)])
         sideways = np.asarray(across @ self._start_T_sonar.rotation().matrix().T)
-        beliefs = self._beliefs.step(association, log_odds, places, sideways)
+        place = self._start_T_sonar.translation()
+        beliefs = self._beliefs.step(association, log_odds, is_looked, place, sideways)
         self.news = self._beliefs.weights
         self.beliefs = each_once(beliefs)
         found = self._report(candidates, association, beliefs)

@@ -17,9 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonar_graph.measurements import Floats, Ints
+from sonar_graph.numerics import compiled
 from sonar_graph.sonar.geometry import FloorView, floor_lift, ranges_azimuths_elevations
 
 Floats32 = NDArray[np.float32]
+Bytes = NDArray[np.uint8]
 MEDIAN_TO_SIGMA = 1.4826
 LEAST_SPREAD_DB = 0.2
 """Below it a level cannot be told from its quantisation."""
@@ -50,16 +52,41 @@ def background_of(
 
 
 def _median(values: Floats32, window: int, steps_per_db: float, zero: float) -> Floats32:
-    """Median over a square window, to half a step.
-
-    Mirrored at the edges, where opencv would repeat the last node; in bytes, the only type of its large medians.
-    """
+    """Median over a square window, to half a step; mirrored at the edges."""
     half = window // 2
     counts = cv2.convertScaleAbs(np.maximum(values, -zero / steps_per_db), alpha=steps_per_db, beta=zero)
-    mirrored = cv2.copyMakeBorder(counts, half, half, half, half, cv2.BORDER_REFLECT_101)
-    middle = np.s_[half : half + values.shape[0], half : half + values.shape[1]]
-    medians = np.asarray(cv2.medianBlur(mirrored, window), dtype=np.float32)[middle]
-    return (medians - np.float32(zero)) / np.float32(steps_per_db)
+    mirrored = np.asarray(cv2.copyMakeBorder(counts, half, half, half, half, cv2.BORDER_REFLECT_101), np.uint8)
+    return (running_median(mirrored, window).astype(np.float32) - np.float32(zero)) / np.float32(steps_per_db)
+
+
+@compiled
+def running_median(counts: Bytes, window: int) -> Bytes:
+    """Median of each square of an odd number of bytes along its sides, shape (rows - window + 1, columns - window + 1).
+
+    By the histogram of a square that moves along a row (Huang, Yang, Tang 1979): of a few thousand nodes it is faster
+    than opencv's median. ``below`` of the square's bytes are less than the median.
+    """
+    rows, columns = counts.shape[0] - window + 1, counts.shape[1] - window + 1
+    medians, middle = np.empty((rows, columns), np.uint8), window * window // 2
+    for i in range(rows):
+        histogram, median, below = np.zeros(256, np.int64), 0, 0
+        for k in range(window):
+            for j in range(window):
+                histogram[counts[i + k, j]] += 1
+        for j in range(columns):
+            for k in range(window if j else 0):
+                gone, come = counts[i + k, j - 1], counts[i + k, j + window - 1]
+                histogram[gone] -= 1
+                histogram[come] += 1
+                below += int(come < median) - int(gone < median)
+            while below > middle:
+                median -= 1
+                below -= histogram[median]
+            while below + histogram[median] <= middle:
+                below += histogram[median]
+                median += 1
+            medians[i, j] = median
+    return medians
 
 
 AREA, LEVEL, X, Y, XX, XY, YY, PIXELS = range(8)

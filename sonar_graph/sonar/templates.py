@@ -114,8 +114,7 @@ def material_radius_m(design: LandmarkDesign) -> float:
 _STEPS_A_BEAM = 4
 
 
-@dataclass(frozen=True, eq=False)
-class Patch:
+class Patch(NamedTuple):
     """The image around a point of the floor."""
 
     level_db: Floats32
@@ -132,8 +131,8 @@ class Patch:
     @classmethod
     def of(cls, level_db: Floats32, seen: Floats32, centre_m: Floats) -> Patch:
         """Patch with these levels."""
-        held = np.asarray(cv2.blur(seen, (3, 3)), np.float32)
-        smooth = np.asarray(cv2.blur(level_db, (3, 3)) / np.maximum(held, np.float32(0.1)), np.float32)
+        held, smooth = np.empty((2, *seen.shape), np.float32)
+        smooth_levels(level_db, seen, smooth, held)
         return cls(level_db, seen, smooth, held, centre_m)
 
 
@@ -180,36 +179,56 @@ def sample_floor(
     Each is the mean of decibels over the bins whose middles a cell covers, or where cells are finer than bins, linear
     between the two nearest; linear between beams. R is ``level_R_sonar``.
     """
-    (beams, bins), side = image_db.shape, len(level)
-    half_bins = 0.5 * cell_m / grid.bin_m
-    is_fine, half = half_bins < 0.5, 0.5 * (side - 1)
+    (beams, bins), side, nodes = image_db.shape, len(level), grid.beam_of_azimuth
+    half_bins, half, z = 0.5 * cell_m / grid.bin_m, 0.5 * (side - 1), -height_m
+    is_fine = half_bins < 0.5
+    reach, places, middles = 1.0 if is_fine else half_bins, np.empty(side), np.empty(side)
     for i in range(side):
+        x = centre[0] + cell_m * (i - half)
         for j in range(side):
-            x, y, z = centre[0] + cell_m * (i - half), centre[1] + cell_m * (j - half), -height_m
-            qx = R[0, 0] * x + R[1, 0] * y + R[2, 0] * z
-            qy = R[0, 1] * x + R[1, 1] * y + R[2, 1] * z
-            qz = R[0, 2] * x + R[1, 2] * y + R[2, 2] * z
-            distance = math.sqrt(x * x + y * y + z * z)
-            if abs(qz) > grid.highest_sine * distance:
+            y = centre[1] + cell_m * (j - half)
+            qx, qy = R[0, 0] * x + R[1, 0] * y + R[2, 0] * z, R[0, 1] * x + R[1, 1] * y + R[2, 1] * z
+            places[j] = (math.atan2(qy, qx) - grid.first_azimuth_rad) / grid.azimuth_step_rad
+        for j in range(side):
+            y = centre[1] + cell_m * (j - half)
+            qz, distance = R[0, 2] * x + R[1, 2] * y + R[2, 2] * z, math.sqrt(x * x + y * y + z * z)
+            is_lit = abs(qz) <= grid.highest_sine * distance
+            middles[j] = (distance - grid.first_range_m) / grid.bin_m if is_lit else -2.0 * reach
+        for j in range(side):
+            place, middle = places[j], middles[j]
+            first, last = math.floor(middle - reach + 1), math.floor(middle + reach)
+            if first < 0 or last >= bins or not 0 <= place < len(nodes) - 1:
                 continue
-            place = (math.atan2(qy, qx) - grid.first_azimuth_rad) / grid.azimuth_step_rad
-            if not 0 <= place < len(grid.beam_of_azimuth) - 1:
+            k, first, last = np.uint32(place), np.uint32(first), np.uint32(last)
+            beam = nodes[k] + (place - k) * (nodes[k + np.uint32(1)] - nodes[k])
+            if beam < 0 or beam > beams - 1:
                 continue
-            k = int(place)
-            beam = grid.beam_of_azimuth[k] + (place - k) * (grid.beam_of_azimuth[k + 1] - grid.beam_of_azimuth[k])
-            middle = (distance - grid.first_range_m) / grid.bin_m
+            b = np.uint32(min(beam, beams - 2))
+            share, one, other = beam - b, image_db[b], image_db[b + np.uint32(1)]
             if is_fine:
-                first, last = math.floor(middle), math.floor(middle) + 1
+                near = (1 - share) * one[first] + share * other[first]
+                far = (1 - share) * one[last] + share * other[last]
+                level[i, j] = near + (middle - first) * (far - near)
             else:
-                first, last = math.floor(middle - half_bins + 1), math.floor(middle + half_bins)
-            if beam < 0 or beam > beams - 1 or first < 0 or last >= bins:
-                continue
-            b = min(int(beam), beams - 2)
-            share = beam - b
-            total, weights = 0.0, 0.0
-            for n in range(first, last + 1):
-                weight = 1 - abs(n - middle) if is_fine else 1.0
-                total += weight * ((1 - share) * image_db[b, n] + share * image_db[b + 1, n])
-                weights += weight
-            level[i, j] = total / weights
+                of_one, of_other = 0.0, 0.0
+                for n in range(first, last + np.uint32(1)):
+                    of_one, of_other = of_one + one[n], of_other + other[n]
+                level[i, j] = (of_one + share * (of_other - of_one)) / (last - first + np.uint32(1))
             seen[i, j] = 1.0
+
+
+@compiled
+def smooth_levels(level: Floats32, seen: Floats32, smooth: Floats32, held: Floats32) -> None:
+    """Fill in means of the levels seen in 3 by 3 cells, mirrored at the rim, and the shares that are seen."""
+    side = len(level)
+    total, count = np.empty(side + 2, np.float32), np.empty(side + 2, np.float32)
+    for i in range(side):
+        before, after = abs(i - 1), side - 1 - abs(side - 2 - i)
+        for j in range(side):
+            total[j + 1] = level[before, j] + level[i, j] + level[after, j]
+            count[j + 1] = seen[before, j] + seen[i, j] + seen[after, j]
+        total[0], total[-1], count[0], count[-1] = total[2], total[-3], count[2], count[-3]
+        for j in range(side):
+            n = count[j] + count[j + 1] + count[j + 2]
+            held[i, j] = n / np.float32(9)
+            smooth[i, j] = (total[j] + total[j + 1] + total[j + 2]) / max(n, np.float32(0.9))

@@ -13,7 +13,7 @@ from sonar_graph.images import SonarFrames
 from sonar_graph.measurements import Floats
 from sonar_graph.sonar.appearance import CENTROID_SIGMA_M, Appearance, CandidateFit, DesignFit, ObjectSighting
 from sonar_graph.sonar.confusion import Confusion, confusion_for
-from sonar_graph.sonar.evidence import EVIDENCE
+from sonar_graph.sonar.evidence import BEHIND, EVIDENCE, FAR, NEAR, Figures
 from sonar_graph.sonar.geometry import FloorView
 from sonar_graph.sonar.templates import Patch, PolarGrid, Templates, material_radius_m
 
@@ -201,6 +201,69 @@ def test_places_and_headings_are_those_of_the_best_correlation_over_the_cells_in
 
 def odds(fit: DesignFit, model: Confusion | None = None) -> np.ndarray:
     return (model or MODEL).log_odds(fit.evidence)
+
+
+def plain_evidence(figures: Figures, template: int, x: int, y: int, patch: Patch) -> list[float]:
+    """The equations of the module in NumPy: least squares on the cells in view, over and over."""
+    rows, side = slice(*figures.first[template : template + 2]), len(patch.seen)
+    i, j = np.divmod(figures.cells[rows], side) + np.array([[x], [y]])
+    seen, held = patch.seen[i, j] > 0, patch.held[i, j] > 0.5
+    level = patch.level_db[i, j] - patch.level_db[i, j][seen].mean()
+    smooth = patch.smooth_db[i, j] - patch.level_db[i, j][seen].mean()
+    values, zones, design = figures.values[rows].astype(float), figures.zones[rows], figures.smooth[rows]
+
+    def fitted(*columns: int) -> tuple[float, Floats]:
+        A, z = values[seen][:, columns], level[seen].astype(float)
+        c = np.linalg.solve(A.T @ A + 1e-3 * np.eye(len(columns)), A.T @ z)
+        return z @ z - c @ (A.T @ z), c
+
+    one, dark, figure, shades = 0, 1, 2, len(values[0]) // 2 + 1
+    plain, (floor, beta) = fitted(one, figure)
+    delta, best, shaded = 0.0, plain, plain
+    if figures.has_dark[template] and fitted(one, figure, dark)[1][2] < 0:
+        best, (floor, beta, delta) = fitted(one, figure, dark)
+    if fitted(one, figure, shades)[1][2] < 0:
+        shaded = fitted(one, figure, shades)[0]
+    both = min(best, shaded)
+    if delta < 0 and shaded < plain and max(fitted(one, figure, dark, shades)[1][2:]) < 0:
+        both = fitted(one, figure, dark, shades)[0]
+    others = [shaded]
+    for q in range(1, shades - figure):
+        with_shade, c = fitted(one, figure + q, shades + q)
+        others.append(with_shade if c[2] < 0 else fitted(one, figure + q)[0])
+    off = smooth - floor - beta * design[:, 1] - delta * design[:, 0]
+    near, far, back = ((zones & zone > 0) & held for zone in (NEAR, FAR, BEHIND))
+    back &= seen
+    mean_square = best / seen.sum()
+    return [
+        1.0,
+        np.log(min(others) / both),
+        np.log(min(fitted(one, figure + q)[0] for q in range(shades - figure)) / plain),
+        np.log(max(beta, 0.5) / np.sqrt(mean_square)),
+        np.log((np.mean(np.maximum(off[near], 0) ** 2) if near.sum() > 8 else mean_square / 3) + 0.3),
+        np.log((np.mean(np.minimum(off[far], 0) ** 2) if far.sum() > 8 else mean_square / 3) + 0.3),
+        np.mean(level[back] - floor) if back.sum() > 5 else 0.0,
+        np.sqrt(max(np.log(shaded / both), 0.0)),
+        float(not figures.has_dark[template]),
+    ]
+
+
+@pytest.mark.parametrize("rim", [99, 30, 26])
+def test_evidence_is_that_of_least_squares_over_the_cells_in_view(appearance, rim: int):
+    """Every design in rough noise, with its plate or dark behind, of which the image holds the first columns."""
+    templates, figures, rng = appearance.templates, appearance.figures, np.random.default_rng(rim)
+    side, has = appearance.patch_side, set()
+    i, j = np.divmod(templates.cells, templates.side) + np.array([[3 + appearance._rim], [2 + appearance._rim]])
+    seen = np.tile(np.arange(side) < rim, (side, 1)).astype(np.float32)
+    for template in range(len(templates.design)):
+        level = rng.normal(40, 4, (side, side)).astype(np.float32)
+        level[i, j] += (0.3, 1.0)[template % 2] * templates.pictures[template]
+        level[side // 2 + (5, 12)[template % 2] :] -= (0, 8)[template // 2 % 2]
+        patch = Patch.of(level * seen, seen, np.zeros(2))
+        (found,) = figures.evidence(patch, np.array([template]), np.array([[3, 2]]))
+        np.testing.assert_allclose(found, plain_evidence(figures, template, 3, 2, patch), atol=5e-5)
+        has |= {name for name, value in zip(EVIDENCE, found, strict=True) if value != 0}
+    assert has == {*EVIDENCE} - ({"bare"} if figures.has_dark.all() else set())
 
 
 def test_gain_and_floor_level_change_nothing(appearance):

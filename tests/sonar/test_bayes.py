@@ -146,8 +146,8 @@ def _after(
     params = IdentityParams.model_validate({"rule": rule} | settings)
     beliefs, before, found = Beliefs(CONFUSION, params), [], []
     for place, log_odds in zip(places, odds or [LOOKS_LIKE_1] * len(places), strict=True):
-        looked = None if place is None else np.array(place)
-        found.append(float(beliefs.step(_association(before, [7]), log_odds, [looked], SIDEWAYS)[0, 0]))
+        looked, place = np.array([place is not None]), np.array(place or (0.0, 0.0, 0.0))
+        found.append(float(beliefs.step(_association(before, [7]), log_odds, looked, place, SIDEWAYS)[0, 0]))
         before = [7]
     return found
 
@@ -186,15 +186,15 @@ def test_beliefs_follow_their_tracks(is_reversed: bool):
     """Rows change places after the frame, or before it."""
     beliefs, scores = Beliefs(CONFUSION), np.array([[6.0, -3.0, 0.0], [-3.0, 6.0, 0.0]])
     place, sideways = np.zeros(3), np.tile(SIDEWAYS, (2, 1))
-    first = beliefs.step(_association([], [3, 4]), scores, [place, place], sideways)
+    first = beliefs.step(_association([], [3, 4]), scores, np.array([True, True]), place, sideways)
     change = _association([4, 3], [3, 4]) if is_reversed else _association([3, 4], [4, 3])
-    after = beliefs.step(change, np.nan * scores, [None, None], sideways)
+    after = beliefs.step(change, np.nan * scores, np.array([False, False]), place, sideways)
     np.testing.assert_allclose(after, first if is_reversed else first[::-1], atol=1e-3)
 
 
 def test_a_new_track_has_the_prior_until_it_is_looked_at_and_a_frame_that_is_not_counted_changes_nothing():
     beliefs = Beliefs(CONFUSION, IdentityParams(unknown_prior=0.6))
-    found = beliefs.step(_association([], [7]), np.full((1, 3), np.nan), [None], SIDEWAYS)
+    found = beliefs.step(_association([], [7]), np.full((1, 3), np.nan), np.array([False]), np.zeros(3), SIDEWAYS)
     np.testing.assert_allclose(found, [[0.2, 0.2, 0.6]])
     kept = _after([(0, 0, 0), None, None])
     assert kept[1:] == pytest.approx([kept[0]] * 2)
@@ -205,5 +205,5 @@ def test_a_new_track_has_the_prior_until_it_is_looked_at_and_a_frame_that_is_not
 def test_places_of_a_track_end_with_it():
     beliefs = Beliefs(CONFUSION)
     for before, after in (([], [7]), ([7], [8])):
-        beliefs.step(_association(before, after), LOOKS_LIKE_1, [np.zeros(3)], SIDEWAYS)
-    assert list(beliefs._looks) == [8]
+        beliefs.step(_association(before, after), LOOKS_LIKE_1, np.array([True]), np.zeros(3), SIDEWAYS)
+    assert beliefs._looked.tolist() == [8]
