@@ -242,7 +242,9 @@ def test_real_frames_names_its_figures(recordings, tmp_path):
     arguments = ("--data", str(recordings), "--workers", "1", "--figure", str(figure))
     found = figures("validation/real_frames.py", *arguments)
     assert found["frames"] == 15
-    assert {"ours", "soca", "soca_power", "actag", "ahead", "passed"} <= set(found)
+    assert {"ours", "soca", "soca_power", "median", "actag", "lead", "passed"} <= set(found)
+    for low, high in zip(found["lead_from"], found["lead_to"], strict=True):
+        assert -1 < low <= high < 1
     assert max(found["ours"]) > 0.8
     assert figure.stat().st_size > 10_000
 

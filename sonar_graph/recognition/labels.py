@@ -50,6 +50,7 @@ CLICK_SIGMA_M = 0.01
 MOST_ROWS = 8
 """Rows of labels that a message lists."""
 OUTSIDE, NO_FRAME, UNUSED = "outside of the image", "no such frame", "of a frame that was not used"
+IN_DEGREES = "outside of the image, but not if the azimuth is in degrees; expected radians"
 NO_TRACK, CONTRADICTED = "no track there", "on a track that has other labels too"
 """Why labels tell nothing."""
 NOWHERE = np.array([-1]), np.array([1e9]), np.array([0.0])
@@ -261,7 +262,10 @@ def _labelled_tracks(
                 tracks[nearest].labelled.append(place_of(label.range_m, label.azimuth_rad, session))
                 row_of[nearest].append(row)
             else:
-                unmet[NO_TRACK if used and _is_within(used[0], label) else OUTSIDE].append(row)
+                in_radians = label.model_copy(update={"azimuth_rad": np.radians(label.azimuth_rad)})
+                places = {NO_TRACK: label, IN_DEGREES: in_radians} if used else {}
+                reason = next((said for said, at in places.items() if _is_within(used[0], at)), OUTSIDE)
+                unmet[reason].append(row)
     unmet[NO_FRAME] = [row for labels in by_stamp.values() for row, _ in labels]
     unmet[CONTRADICTED] = [row for number, rows in row_of.items() if len(tracks[number].ids) > 1 for row in rows]
     return tracks, unmet

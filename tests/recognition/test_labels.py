@@ -67,7 +67,8 @@ def test_a_few_labels_measure_what_the_whole_truth_does(lane, lane_log, clicks, 
     assert by_labels.range_sigma_m < 0.02
     said = by_labels.provenance["labels 1"]
     assert re.match(rf"out\.csv: \d+ of {len(given.labels)} labels met a track", said)
-    assert "; rows 1, 3, 5: outside of the image" in said
+    assert "; rows 1, 5: outside of the image;" in said
+    assert "; row 3: outside of the image, but not if the azimuth is in degrees; expected radians" in said
     assert "; row 2: no such frame" in said
     assert re.search("; rows? 4[^;]*: no track there", said)
 
