@@ -17,7 +17,7 @@ that is farther away than `APART_S`. Its standard deviation is that of a jackkni
 of motion from images last for seconds, and one by independent steps was six times too small on pieces of 10 s.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -82,17 +82,21 @@ class NavigationMotion:
         steps = [motions.at(stamp_ns)[0] for stamp_ns in stamps.tolist()]
         tangents = [np.zeros(6) if step is None else gtsam.Pose3.Logmap(step.previous_T_sonar) for step in steps]
         self.epoch_ns = int(stamps[0]) if len(stamps) else first_ns
-        self._seconds, self._sums = (stamps - self.epoch_ns) * 1e-9, np.cumsum(tangents, axis=0)
+        self._sums = np.cumsum(tangents, axis=0)
 
     def over(self, start_s: Floats, end_s: Floats) -> Floats:
         """Sums of the tangents over stretches, in seconds after the epoch, shape (n, 6); NaN where not covered."""
-        if len(self._seconds) < 2:
+        if len(self._sums) < 2:
             return np.full((len(start_s), 6), np.nan)
-        start, end = (
-            np.column_stack([np.interp(t, self._seconds, column, np.nan, np.nan) for column in self._sums.T])
-            for t in (start_s, end_s)
-        )
-        return np.asarray(end - start)
+        return self._until(end_s) - self._until(start_s)
+
+    def _until(self, seconds: Floats) -> Floats:
+        """Sums until instants, linear between those of the grid."""
+        place = np.asarray(seconds) * (NS_PER_S / GRID_NS)
+        before = np.clip(place.astype(np.intp), 0, len(self._sums) - 2)
+        sums = self._sums[before] + (place - before)[:, None] * (self._sums[before + 1] - self._sums[before])
+        sums[(place < 0) | (place > len(self._sums) - 1)] = np.nan
+        return np.asarray(sums)
 
 
 def estimate_offset(
@@ -129,8 +133,11 @@ def estimate_offset(
     yaw, x, y = np.array([step.motion for step in known]).T
     z = np.column_stack([x, y + range_m * yaw])
     offsets_s = around_s + np.arange(-search_s, search_s + 0.5 * OFFSET_STEP_S, OFFSET_STEP_S)
-    moved = [navigation.over(start_s + s, end_s + s) for s in offsets_s.tolist()]
-    counts = np.array([np.isfinite(f[:, 0]).sum() for f in moved])
+
+    def moved(offset_s: float) -> Floats:
+        return navigation.over(start_s + offset_s, end_s + offset_s)
+
+    counts = np.array([np.isfinite(moved(s)[:, 0]).sum() for s in offsets_s.tolist()])
     is_covered = counts >= max(LEAST_STEPS, LEAST_SHARE * counts.max())
     if not is_covered.any():
         raise LogError(
@@ -139,12 +146,13 @@ def estimate_offset(
         )
     likely = np.where(is_covered, 0.0, -np.inf)
     most = np.quantile(np.abs(z), CLIPPED_AT, axis=0)
-    rough = _profile(np.clip(z, -most, most), moved, likely, np.ones(2))
-    residuals = z - _fitted(z, moved[int(np.argmax(rough))])
+    rough = _profile(np.clip(z, -most, most), moved, offsets_s, likely, np.ones(2))
+    at_rough = moved(float(offsets_s[np.argmax(rough)]))
+    residuals = z - _fitted(z, at_rough)
     spread = 1.4826 * np.nanmedian(np.abs(residuals), axis=0)
     z = np.where(np.abs(residuals) > OUTLYING * spread, np.nan, z)
-    repetition = np.array([_repetition(column) for column in (z - _fitted(z, moved[int(np.argmax(rough))])).T])
-    found = _profile(z, moved, likely, repetition)
+    repetition = np.array([_repetition(column) for column in (z - _fitted(z, at_rough)).T])
+    found = _profile(z, moved, offsets_s, likely, repetition)
     best = int(np.argmax(found))
     if best in (0, len(found) - 1):
         raise LogError(
@@ -152,24 +160,28 @@ def estimate_offset(
             f"--search SECONDS, or {AS_STATED}"
         )
     seconds, near = _top(offsets_s, found), np.abs(offsets_s - offsets_s[best]) <= APART_S
-    sigma_s = _jackknife(z, [f for f, is_near in zip(moved, near, strict=True) if is_near], offsets_s[near])
+    sigma_s = _jackknife(z, moved, offsets_s[near])
     nats = float(found[best]) - float(found[np.abs(offsets_s - seconds) > APART_S].max(initial=0.0))
     if nats < LEAST_NATS or sigma_s > LARGEST_SIGMA_S:
         raise LogError(
             f"{CANNOT_TELL}: the likeliest, {seconds:+.2f} s ± {sigma_s:.2f} s, is only exp({nats:.1f}) times as "
             f"likely as others: the motion hardly changes, or the images show it badly; {AS_STATED}"
         )
-    f = navigation.over(start_s + seconds, end_s + seconds)
-    fitted = _fitted(z, f)
+    fitted = _fitted(z, f := moved(seconds))
     ahead, across = (_correlation(z[:, c], fitted[:, c]) for c in range(2))
     return ClockOffset(seconds, sigma_s, int(np.isfinite(f[:, 0]).sum()), (ahead, across), nats)
 
 
-def _profile(z: Floats, moved: Sequence[Floats], likely: Floats, repetition: Floats) -> Floats:
-    """Likelihood of each offset in nats over no relation, -inf where it is not covered, shape as ``likely``."""
+def _profile(
+    z: Floats, moved: Callable[[float], Floats], offsets_s: Floats, likely: Floats, repetition: Floats
+) -> Floats:
+    """Likelihood of each offset in nats over no relation, -inf where it is not covered, shape as ``likely``.
+
+    ``moved``: motion of the navigation with an offset, made anew each time: for all offsets it would fill the memory.
+    """
     profile = likely.copy()
     for at in np.flatnonzero(np.isfinite(likely)).tolist():
-        fitted = _fitted(z, moved[at])
+        fitted = _fitted(z, moved(float(offsets_s[at])))
         for c in range(2):
             n = np.isfinite(z[:, c] + fitted[:, c]).sum() / repetition[c]
             profile[at] -= 0.5 * n * np.log1p(-(min(_correlation(z[:, c], fitted[:, c]), 0.99999) ** 2))
@@ -186,13 +198,13 @@ def _top(offsets_s: Floats, profile: Floats) -> float:
     return float(offsets_s[at] + (0.5 * OFFSET_STEP_S * (before - after) / bend if -np.inf < bend < 0 else 0.0))
 
 
-def _jackknife(z: Floats, moved: Sequence[Floats], offsets_s: Floats) -> float:
+def _jackknife(z: Floats, moved: Callable[[float], Floats], offsets_s: Floats) -> float:
     """Standard deviation by leaving out one stretch of the steps after the other."""
     tops = []
     for left_out in np.array_split(np.arange(len(z)), STRETCHES):
         rest = z.copy()
         rest[left_out] = np.nan
-        tops.append(_top(offsets_s, _profile(rest, moved, np.zeros(len(moved)), np.ones(2))))
+        tops.append(_top(offsets_s, _profile(rest, moved, offsets_s, np.zeros(len(offsets_s)), np.ones(2))))
     return float(np.sqrt((STRETCHES - 1) * np.var(tops)))
 
 
