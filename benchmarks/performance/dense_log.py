@@ -186,6 +186,7 @@ def main() -> None:
     found = []
     for sequence in logs(arguments.data, is_quick=arguments.quick):
         if arguments.only.lower() in sequence.name.lower():
+            gc.collect()  # what the log before left, which no single log's user has
             found.append(run(sequence, 120.0 if arguments.quick else None))
             print_figures(found[-1])
     if not found:
