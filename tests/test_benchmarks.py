@@ -346,12 +346,23 @@ def test_scenes_count_passes_of_landmarks_and_of_each_group_of_strangers_and_jud
     assert (found["accepted"], found["right"]) == (8, 0.25)
     assert (found["tracks"], found["wrong_above_99"]) == (8, (2, 4))
     assert found["range_bias_m"] == pytest.approx(0.01)
+    assert found["nis"] == found["nis_of_reports"] == pytest.approx(0.01**2 / 2)
     assert not scenes.reaches("hard", found)
     fine = {name: {"hits": 19, "passes": 20} for name in ("recognised",)}
     fine |= {name: {"hits": 0, "passes": 20} for name in ("natural", "look_alikes")} | {"ece_of_tracks": 0.01}
     assert scenes.reaches("0 dB", fine)
     assert not scenes.reaches("0 dB", fine | {"recognised": {"hits": 18, "passes": 20}})
     assert scenes.reaches("-4.5 dB", fine | {"recognised": {"hits": 18, "passes": 20}})
+
+
+def test_an_error_that_repeats_counts_as_often_as_it_is_reported(scenes, monkeypatch):
+    class Model:
+        report_interval = staticmethod(lambda: 10)
+
+    monkeypatch.setattr(scenes, "read_confusion", lambda _: Model)
+    found = scenes.summary([a_run([(k, 1, 1, 0.9, 1) for k in range(21)])], "r")
+    assert found["nis"] == pytest.approx(0.01**2 / 2)
+    assert found["nis_of_reports"] == pytest.approx(3 * 0.01**2 / 2)  # rows 0, 10 and 20
 
 
 def test_wilsons_interval_is_the_published_one(scenes):

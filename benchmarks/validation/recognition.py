@@ -130,7 +130,7 @@ def summarise(runs: list[Run], rule: str) -> Summary:
     recognised, fooled, delays_s = (np.concatenate([getattr(w, n) for w in watched]) for n in Watched._fields[:3])
     middles, means = (np.concatenate([getattr(w, n) for w in watched]) for n in ("nis", "mean_nis"))
     error = np.concatenate([d.error[r] for d, r in zip(found, right, strict=True)])
-    everything = np.concatenate([_normalised(d, r) for d, r in zip(found, right, strict=True)])
+    everything = np.concatenate([normalised(d, r) for d, r in zip(found, right, strict=True)])
     judged = _reliability(found, [np.arange(len(d.named)) for d in found])
     freedom = 2 * len(middles)
     band = chi2.ppf([0.025, 0.975], freedom) / freedom
@@ -182,8 +182,8 @@ def _watched(run: Run, found: Detections, accepted: np.ndarray, right: np.ndarra
         recognised.append(len(hits) > 0)
         if len(hits):
             delay_s.append(found.stamp_s[hits[0]] - run.passes.begin_s[row])
-            nis.append(_normalised(found, hits[len(hits) // 2]))
-            mean_nis.append(_normalised_mean(found, hits))
+            nis.append(normalised(found, hits[len(hits) // 2]))
+            mean_nis.append(normalised_mean(found, hits))
     return Watched(*map(np.array, (recognised, fooled, delay_s, nis, mean_nis)), np.array(middle, dtype=int))
 
 
@@ -196,13 +196,13 @@ def _by_pass(passes: Passes, found: Detections) -> list[tuple[int, np.ndarray]]:
     return result
 
 
-def _normalised(found: Detections, rows: Any) -> np.ndarray:
+def normalised(found: Detections, rows: Any) -> np.ndarray:
     """Normalised squared error per degree of freedom."""
     e, C = found.error[rows], found.covariance[rows]
     return np.asarray(np.einsum("...i,...i->...", e, np.linalg.solve(C, e[..., None])[..., 0]) / 2)
 
 
-def _normalised_mean(found: Detections, rows: np.ndarray) -> float:
+def normalised_mean(found: Detections, rows: np.ndarray) -> float:
     """NEES of the information-weighted mean per degree of freedom, as if errors were independent."""
     information = np.linalg.inv(found.covariance[rows])
     total = np.einsum("nij,nj->i", information, found.error[rows])

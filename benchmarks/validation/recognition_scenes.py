@@ -11,7 +11,9 @@ fitted to these scenes.
 * `right`: share of accepted detections that are right;
 * `ece_of_tracks`: expected calibration error of the most probable class, of the last detection of each track;
 * `wrong_above_99`: share of the tracks with more than 0.99 at their end that are wrong;
-* `range_bias_m`, `azimuth_bias_deg`: mean error of right accepted detections, each pass as one.
+* `range_bias_m`, `azimuth_bias_deg`: mean error of right accepted detections, each pass as one;
+* `nis`: normalised error per degree of freedom, each pass as one; `nis_of_reports` that of the mean of the detections
+  that are reported as independent, one in every `Confusion.report_interval` frames: 1 if they were.
 
 Intervals are Wilson's at 95 %, over passes. It passes when our rule reaches `LEAST_RECOGNISED` where one is given, and
 `MOST` everywhere.
@@ -26,13 +28,14 @@ import numpy as np
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from common import conclude, in_parallel, make_parser, print_table
-from recognition import ACCEPTED, LITERAL, OURS, digest
+from recognition import ACCEPTED, LITERAL, OURS, digest, normalised, normalised_mean
 from recognition_runs import NONE, UNJUDGED, Detections, Run, kept_run
 
 from sonar_graph.evaluation.consistency import reliability
 from sonar_graph.simulation import BasinOptions
 from sonar_graph.simulation.sonar_image import ImageOptions
 from sonar_graph.simulation.sonar_image.strangers import GROUPS
+from sonar_graph.sonar import SHIPPED, read_confusion
 
 STRANGERS = {"strangers": ["natural", "look-alikes"]}
 CASES: dict[str, dict[str, Any]] = {
@@ -40,6 +43,7 @@ CASES: dict[str, dict[str, Any]] = {
     **{f"{c:g} dB, a quarter covered": {"contrast_db": c, "sediment": 0.25} for c in (0.0, -3.0, -4.5, -6.0)},
     "plate as bright as the floor": {"plate_db": 0.0},
     **{scene: {"scene": scene} for scene in ("murky", "worn", "hard")},
+    **{f"window of {length} m": {"window_m": float(length)} for length in (7, 10)},
 }
 LEAST_RECOGNISED = {
     **{"0 dB": 0.95, "-3 dB": 0.95, "-4.5 dB": 0.90, "-6 dB": 0.75},
@@ -77,7 +81,8 @@ def wilson(hits: int, total: int) -> tuple[float, float]:
 def summary(runs: list[Run], rule: str) -> dict[str, Any]:
     """Figures of one rule over all seeds."""
     outcomes: dict[str, list[bool]] = {"recognised": [], "natural": [], "look_alikes": []}
-    accepted, right, bias, ends = 0, 0, [], []
+    accepted, right, bias, ends, nis, nis_of_reports = 0, 0, [], [], [], []
+    interval = read_confusion(SHIPPED).report_interval()
     for run in runs:
         found = run.detections[rule]
         is_accepted = found.is_named & (found.probability >= ACCEPTED)
@@ -88,7 +93,11 @@ def summary(runs: list[Run], rule: str) -> dict[str, Any]:
             if object_id > 0:
                 hits = is_right & of_it
                 outcomes["recognised"].append(bool(hits.any()))
-                bias += [found.error[hits].mean(axis=0)] if hits.any() else []
+                if hits.any():
+                    rows = np.flatnonzero(hits)
+                    bias.append(found.error[rows].mean(axis=0))
+                    nis.append(float(normalised(found, rows).mean()))
+                    nis_of_reports.append(normalised_mean(found, rows[::interval]))
             else:
                 looks_alike = run.passes.kind[row] in GROUPS["look-alikes"]
                 outcomes["look_alikes" if looks_alike else "natural"].append(bool((is_accepted & of_it).any()))
@@ -106,6 +115,8 @@ def summary(runs: list[Run], rule: str) -> dict[str, Any]:
         "wrong_above_99": (int((is_correct[sure] == 0).sum()), int(sure.sum())),
         "range_bias_m": float(mean_bias[0]) if bias else None,
         "azimuth_bias_deg": float(np.degrees(mean_bias[1])) if bias else None,
+        "nis": float(np.mean(nis)) if nis else None,
+        "nis_of_reports": float(np.mean(nis_of_reports)) if nis else None,
     }
 
 
@@ -135,7 +146,9 @@ def show(summaries: dict[str, dict[str, dict[str, Any]]]) -> None:
             wrong, sure = s["wrong_above_99"]
             right = "" if s["right"] is None else f"{s['right']:.4f}"
             bias = "" if s["range_bias_m"] is None else f"{s['range_bias_m'] * 1e3:.1f}"
-            rows.append((name, rule, *shares, right, s["tracks"], f"{s['ece_of_tracks']:.3f}", f"{wrong}/{sure}", bias))
+            nis = ["" if s[n] is None else f"{s[n]:.2f}" for n in ("nis", "nis_of_reports")]
+            ece, wrong_share = f"{s['ece_of_tracks']:.3f}", f"{wrong}/{sure}"
+            rows.append((name, rule, *shares, right, s["tracks"], ece, wrong_share, bias, *nis))
     headers = (
         "",
         "rule",
@@ -147,6 +160,8 @@ def show(summaries: dict[str, dict[str, dict[str, Any]]]) -> None:
         "ECE",
         "wrong > 0.99",
         "range bias mm",
+        "NIS",
+        "of reports",
     )
     print_table(headers, rows)
 

@@ -65,6 +65,8 @@ class LabelledFits:
     """Measured minus true (m, rad), shape (n, 2); NaN where there is no landmark."""
     range_per_height: Floats
     """`ObjectSighting.range_per_height`, shape (n,)."""
+    bin_m: Floats
+    """`ObjectSighting.bin_m`, shape (n,)."""
 
 
 class LabelledSightings:
@@ -72,7 +74,7 @@ class LabelledSightings:
 
     def __init__(self, ids: tuple[int, ...]) -> None:
         self.ids = ids
-        self._rows: list[tuple[Floats, float, int, tuple[int, int], float, tuple[float, float], float]] = []
+        self._rows: list[tuple[Floats, float, int, tuple[int, int], float, tuple[float, float], float, float]] = []
 
     def add(
         self,
@@ -92,12 +94,14 @@ class LabelledSightings:
         if known:
             error = sighting.range_m - range_m[at], sighting.azimuth_rad - azimuth_rad[at]
         row = self.ids.index(label) if known else len(self.ids)
-        self._rows.append((fit.evidence, fit.visible, row, track, news, error, sighting.range_per_height))
+        self._rows.append(
+            (fit.evidence, fit.visible, row, track, news, error, sighting.range_per_height, sighting.bin_m)
+        )
 
     def fits(self) -> LabelledFits:
         """All of them as columns."""
-        columns = zip(*self._rows, strict=True) if self._rows else [()] * 7
-        evidence, visible, label, track, news, error, rise = columns
+        columns = zip(*self._rows, strict=True) if self._rows else [()] * 8
+        evidence, visible, label, track, news, error, rise, bin_m = columns
         return LabelledFits(
             np.array(evidence, float).reshape(-1, len(self.ids), len(EVIDENCE)),
             np.array(visible, float),
@@ -106,6 +110,7 @@ class LabelledSightings:
             np.array(news, float),
             np.array(error, float).reshape(-1, 2),
             np.array(rise, float),
+            np.array(bin_m, float),
         )
 
 
@@ -216,7 +221,9 @@ def estimate_confusion(
     matrix = confusion_rows(soft_scores(odds, looks), fits.label, trials)
     height_bias_m, error = without_height(fits)
     seen = max(int(tracks[:-1].sum()), 2)
-    mean_squares = np.nanmean((error * fits.visible[:, None] ** 2) ** 2, axis=0)
+    bin_m = float(np.median(fits.bin_m))
+    looks_lost = np.maximum(fits.bin_m / bin_m, 1.0)[:, None]  # as `Confusion.range_azimuth_cov`
+    mean_squares = np.nanmean((error * fits.visible[:, None] ** 2) ** 2 / looks_lost, axis=0)
     sigmas = np.sqrt(mean_squares * seen / (seen - 1))  # errors of a track repeat, and the bias is that of these tracks
     return Confusion(
         ids=ids,
@@ -227,6 +234,7 @@ def estimate_confusion(
         doubt=shipped.doubt,
         range_sigma_m=float(sigmas[0]),
         azimuth_sigma_rad=float(sigmas[1]),
+        bin_m=bin_m,
         height_bias_m=height_bias_m,
         error_correlation=error_correlation(error, fits.track),
         provenance=provenance

@@ -253,6 +253,8 @@ class ObjectSighting:
     """Of range and azimuth, shape (2, 2)."""
     range_per_height: float = 0.0
     """Metres of range by which the landmark's face seems nearer for each metre that it is higher; 0: not known."""
+    bin_m: float = math.nan
+    """Length of the frame's range bins."""
 
 
 class CandidateFit:
@@ -300,8 +302,8 @@ class CandidateFit:
         best = int(np.argmax(model.log_odds(fit.evidence)))
         range_m, azimuth_rad = ahead.range_azimuth(fit.centre_m[best])
         rise = 0.0 if view is None else view.height_m / range_m
-        covariance = model.range_azimuth_cov(fit.visible)
-        return ObjectSighting(fit, range_m + model.height_bias_m * rise, azimuth_rad, covariance, rise)
+        covariance, bin_m = model.range_azimuth_cov(fit.visible, self._grid.bin_m), self._grid.bin_m
+        return ObjectSighting(fit, range_m + model.height_bias_m * rise, azimuth_rad, covariance, rise, bin_m)
 
     def log_odds(self, sightings: Sequence[ObjectSighting | None]) -> Floats:
         """Log odds of each design against none of them, last 0 for these, shape (M, designs + 1).

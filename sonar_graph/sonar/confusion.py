@@ -77,6 +77,8 @@ class Confusion(Section):
     """Standard deviation of the range in a frame that shows the whole landmark."""
     azimuth_sigma_rad: float = Field(gt=0, allow_inf_nan=False)
     """The same of the azimuth."""
+    bin_m: float | None = Field(None, gt=0, allow_inf_nan=False)
+    """Length of the range bins of the frames in which these were measured; None: they hold for bins of any length."""
     height_bias_m: float = Field(0.0, gt=-1, lt=1)
     """Height of the faces that sound sees over the heights of the true landmarks."""
     error_correlation: float = Field(0.0, ge=0, lt=1)
@@ -132,12 +134,14 @@ class Confusion(Section):
         """Log odds of each design against none of them, shape (..., designs), from evidence (..., designs, 9)."""
         return np.asarray(evidence @ np.array(self.weights))
 
-    def range_azimuth_cov(self, visible: float) -> Floats:
-        """Covariance of range and azimuth of a landmark with this share in view, shape (2, 2).
+    def range_azimuth_cov(self, visible: float, bin_m: float) -> Floats:
+        """Covariance of range and azimuth of a landmark with this share in view, in bins of this length, shape (2, 2).
 
-        Sigmas grow with the inverse square of the share, as measured on simulated basins.
+        Sigmas grow with the inverse square of the share, as measured on simulated basins. Variances grow with the bins:
+        a bin is one look at the speckle, so that a landmark has half as many where bins are twice as long.
         """
-        return np.diag(np.square(np.array([self.range_sigma_m, self.azimuth_sigma_rad]) / visible**2))
+        longer = 1.0 if self.bin_m is None else max(bin_m / self.bin_m, 1.0)
+        return np.diag(np.square(np.array([self.range_sigma_m, self.azimuth_sigma_rad]) / visible**2) * longer)
 
     def report_interval(self) -> int:
         """Number of frames of a track that tell as much of a place as one independent frame.

@@ -24,7 +24,7 @@ IDS, RANGE_M, AZIMUTH_RAD = np.array([5, 3]), np.array([2.0, 1.5]), np.array([0.
 def sighting(range_m: float, azimuth_rad: float, *, is_compared: bool = True) -> ObjectSighting:
     evidence = np.outer([0.9, 0.3], np.ones(len(EVIDENCE)))
     fit = DesignFit(evidence, 0.95, np.zeros(2), np.zeros((2, 2))) if is_compared else None
-    return ObjectSighting(fit, range_m, azimuth_rad, np.eye(2), 0.5)
+    return ObjectSighting(fit, range_m, azimuth_rad, np.eye(2), 0.5, 0.003)
 
 
 def test_a_sighting_is_of_what_truly_lies_there():
@@ -57,6 +57,7 @@ def test_sightings_become_columns_with_their_errors():
     np.testing.assert_allclose(fits.visible, 0.95)
     np.testing.assert_allclose(fits.news, [0, 0.25, 0.5])
     np.testing.assert_allclose(fits.range_per_height, 0.5)
+    np.testing.assert_allclose(fits.bin_m, 0.003)
     np.testing.assert_allclose(fits.range_azimuth_error[:2], [[0.01, 0.002], [-0.01, 0]], atol=1e-12)
     assert np.isnan(fits.range_azimuth_error[2]).all()
     assert stranger.fits().evidence.shape == (0, 2, len(EVIDENCE))
@@ -158,7 +159,14 @@ def _fits(per_class: int, noise: float, seed: int = 0, scale: float = 1.0) -> co
     odds = wanted + rng.normal(0, noise, wanted.shape)
     n = len(label)
     return confusion_fit.LabelledFits(
-        odds[..., None] * direction, np.ones(n), label, np.arange(n), np.ones(n), error, np.full(n, 0.5)
+        odds[..., None] * direction,
+        np.ones(n),
+        label,
+        np.arange(n),
+        np.ones(n),
+        error,
+        np.full(n, 0.5),
+        np.full(n, 0.003),
     )
 
 
@@ -231,7 +239,23 @@ def test_sigmas_are_root_mean_squares_of_a_landmark_that_is_wholly_in_view():
     assert [model.range_sigma_m, model.azimuth_sigma_rad] == pytest.approx(sigmas, rel=0.05)
     assert partly.range_sigma_m == pytest.approx(0.01, rel=0.15)
     variances = np.nanmean(cut.range_azimuth_error**2, axis=0)
-    np.testing.assert_allclose(np.diag(partly.range_azimuth_cov(0.7)), variances * 600 / 599, rtol=1e-9)
+    np.testing.assert_allclose(np.diag(partly.range_azimuth_cov(0.7, 0.003)), variances * 600 / 599, rtol=1e-9)
+
+
+def test_longer_bins_have_fewer_looks_and_shorter_ones_are_not_known_to_be_better():
+    """Half of the frames from bins four times as long, with errors twice as large."""
+    fits = _fits(300, 1.0)
+    far = np.arange(900) % 5 < 2
+    scale = np.where(far, 2.0, 1.0)[:, None]
+    mixed = replace(fits, bin_m=np.where(far, 0.012, 0.003), range_azimuth_error=fits.range_azimuth_error * scale)
+    model = confusion_fit.estimate_confusion(mixed, (1, 2), {})
+    assert model.bin_m == 0.003
+    assert [model.range_sigma_m, model.azimuth_sigma_rad] == pytest.approx((0.01, 0.002), rel=0.1)
+    near, long, short = (model.range_azimuth_cov(0.9, bin_m) for bin_m in (0.003, 0.012, 0.001))
+    np.testing.assert_allclose(long, 4 * near)
+    np.testing.assert_array_equal(short, near)
+    anywhere = model.model_copy(update={"bin_m": None})
+    np.testing.assert_array_equal(anywhere.range_azimuth_cov(0.9, 0.012), near)
 
 
 def test_frames_of_a_track_count_together():
