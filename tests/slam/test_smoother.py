@@ -281,6 +281,26 @@ def test_on_the_rail_restarts_of_a_bounded_window_change_nothing(monkeypatch):
     assert_is_least_squares(fed, rail(61)[1], 61)
 
 
+@pytest.mark.parametrize("last", [20, 40, 60])
+def test_a_bounded_window_that_runs_away_for_long_counts_each_factor_once_and_forgets_what_is_old(monkeypatch, last):
+    """Also where it does so again when it begins anew; as soon as it no longer does, it is least squares."""
+    found = FixedLagWindow.estimate
+
+    def overshooting(window: FixedLagWindow) -> gtsam.Values:
+        estimate = found(window)
+        if any(window.holds(X(k)) for k in range(20, last + 1)) and not window.holds(X(last + 1)):
+            estimate.update(L(4), np.array([1e4, 0.0, 0.0]))
+        return estimate
+
+    monkeypatch.setattr(FixedLagWindow, "estimate", overshooting)
+    fed, (_, numbers) = on_the_rail(61, 3.1, is_bounded=True), rail(61)
+    keys = list(fed.smoother.values.keys())
+    assert fed.smoother.in_window(keys) == keys
+    if last < 60:
+        assert_is_least_squares(fed, numbers, 61)
+    assert fed.smoother.values.atPoint3(L(4))[0] == pytest.approx(numbers.solution(61)[0]["l4"], abs=0.1)
+
+
 def test_drift_beyond_what_cholesky_takes_is_survived():
     """A pose uncertain by 20 m with millimetre steps: the plain solver gives up, the smoother agrees with algebra."""
     smoother, sigmas = smoother_with(FOREVER_S, 1e-3, NEVER_M), np.array([20.0, 0.002])

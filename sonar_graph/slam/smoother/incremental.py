@@ -391,7 +391,8 @@ class Smoother:
             del self._expiring[key]
         self._left.update(left)
         self._store.leave(left)
-        self._taken_up = self._window.factors, self._window.linearised_at
+        # copies: an update that fails or runs away would change GTSAM's own
+        self._taken_up = gtsam.NonlinearFactorGraph(self._window.factors), gtsam.Values(self._window.linearised_at)
 
     def _give_up_cholesky(self, time_s: float) -> None:
         """Go on by QR after Cholesky met a pose far less certain than its step; `EstimatorError` where QR fails too."""
@@ -417,7 +418,7 @@ class Smoother:
         except RuntimeError as error:
             raise EstimatorError(f"isam2: {self._blame().reasons(graph, self.values)}") from error
         estimate = self._window.estimate()
-        self._take(gtsam.Values(self.values) if self._has_run_away(estimate) else estimate)
+        self._take(picked(self.values, estimate.keys()) if self._has_run_away(estimate) else estimate)
 
     @property
     def landmark_ids(self) -> list[int]:
