@@ -41,7 +41,6 @@ from sonar_graph.measurements import Floats
 from sonar_graph.motion import MotionSource
 from sonar_graph.numerics import compiled, rotation_from_euler, vec
 from sonar_graph.slam.landmarks import ACCEPTED
-from sonar_graph.slam.models import wrap_angle
 
 
 @compiled
@@ -80,7 +79,7 @@ def advance(
         else:
             break
         k += 1
-        if abs(wrap_angle(x[4])) >= MOST_PITCH_RAD:
+        if abs(x[4]) >= MOST_PITCH_RAD:
             break
     return k
 
@@ -136,7 +135,7 @@ class EkfSlam(FilterShell):
         """Predict over epochs and correct by depth, from event k on, and take note of a pitch of 90 degrees or more."""
         state = self._x, self._P, self.turned, self.impulse
         k = advance(*state, self.earth, self.port, self.depth_variance, *self.sonar[:3], events, k)
-        if abs(wrap_angle(self._x[4])) >= MOST_PITCH_RAD:
+        if abs(self._x[4]) >= MOST_PITCH_RAD:
             self._overturned = self._overturned or [
                 f"pitch came to {math.degrees(self._x[4]):.0f} deg, first at {int(events.start_ns[k])} ns, where the"
                 " Euler angles of its state are singular, or beyond: the filter has lost its way, by wrong gyros,"

@@ -9,7 +9,7 @@ import pytest
 
 from sonar_graph.errors import LogError
 from sonar_graph.measurements import Floats
-from sonar_graph.recognition.clock_offset import ClockOffset, estimate_offset
+from sonar_graph.recognition.clock_offset import ClockOffset, NavigationMotion, estimate_offset
 from sonar_graph.recognition.image_motion import ImageMotions, PlanarStep
 from tests.recognition.imaged_lane import Lane
 
@@ -53,6 +53,17 @@ def test_an_offset_is_found_within_its_sigma(lane, steps, offset_s):
 def test_an_offset_is_searched_about_what_was_stated(lane, steps):
     found = estimated(lane, steps, 50.3, around_s=50.0, search_s=2.0)
     assert abs(found.seconds - 50.3) < 3 * found.sigma_s + 0.01
+
+
+def test_motion_of_stretches_adds_up_to_the_end_of_the_log_and_is_unknown_beyond(lane):
+    first_ns = lane.sequence.start_ns
+    motion = NavigationMotion(lane.sequence, first_ns, first_ns + round(2e9))
+    first, second, both, beyond, before = motion.over(
+        np.array([0.33, 1.21, 0.33, 1.21, -0.01]), np.array([1.21, 1.99, 1.99, 2.01, 1.0])
+    )
+    assert np.abs(both).max() > 0.1
+    assert first + second == pytest.approx(both, abs=1e-12)
+    assert np.isnan([beyond, before]).all()
 
 
 def test_steps_that_err_wildly_are_left_out(lane, steps):

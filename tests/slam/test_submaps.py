@@ -3,72 +3,17 @@
 import gtsam
 import numpy as np
 import pytest
-from gtsam.symbol_shorthand import B, L, X
+from gtsam.symbol_shorthand import L, X
 
-from sonar_graph.numerics import Mat3, mat
 from sonar_graph.slam.models import factors
 from sonar_graph.slam.smoother import FactorGroup, incremental, submap_window
 from sonar_graph.slam.smoother.batch_solution import picked
-from sonar_graph.slam.smoother.submap_factor import SubmapFactor, turn_from, yaw_from
 from sonar_graph.slam.smoother.submap_window import Submap, bending
-from sonar_graph.testing import check_derivative
 
 from .fed import Fed, assert_is_least_squares, in_the_basin, on_the_rail
 from .graphs import off_sigmas
 from .made import graph_of, huber, isotropic, motion_of, plain, point_prior, pose_prior, values_of
 from .rail import STEP_S, rail
-
-KEYS = [X(3), X(9), L(1), L(2), B(0)]
-SIZES = {X(3): 6, X(9): 6, L(1): 3, L(2): 3, B(0): 11}
-
-
-def some_values(seed: int, roll_rad: float = 0.0) -> gtsam.Values:
-    rng, rolled = np.random.default_rng(seed), gtsam.Pose3(gtsam.Rot3.Rx(roll_rad), np.zeros(3))
-    moved = {k: gtsam.Pose3.Expmap(rng.normal(size=6) * [0.4, 0.4, 2.0, 3, 3, 3]) for k in (3, 9)}
-    poses = {f"X{k}": pose.compose(rolled) for k, pose in moved.items()}
-    return values_of(**poses, L1=5 * rng.normal(size=3), L2=5 * rng.normal(size=3), B0=0.01 * rng.normal(size=11))
-
-
-def rows(R: gtsam.Rot3) -> Mat3:
-    """A rotation as compiled code takes it."""
-    return mat(R.matrix())
-
-
-def moved_by(values: gtsam.Values, step: dict[int, np.ndarray]) -> gtsam.Values:
-    vector = values.zeroVectors()
-    moved = gtsam.VectorValues()
-    for key in SIZES:
-        moved.insert(key, step.get(key, vector.at(key)))
-    return values.retract(moved)
-
-
-def random_summary(values: gtsam.Values) -> tuple[np.ndarray, np.ndarray, gtsam.CustomFactor]:
-    rng = np.random.default_rng(7)
-    A, b = rng.normal(size=(21, 29)), rng.normal(size=21)
-    return A, b, SubmapFactor(KEYS, A, b, values).factor()
-
-
-def test_where_it_was_made_a_summary_is_the_marginal():
-    values = some_values(0)
-    A, b, factor = random_summary(values)
-    found_A, found_b = factor.linearize(values).jacobian()
-    assert found_A == pytest.approx(A, abs=1e-12)
-    assert found_b == pytest.approx(b, abs=1e-12)
-
-
-@pytest.mark.parametrize("roll_rad", [0.0, 3.0])
-@pytest.mark.parametrize("seed", range(4))
-def test_elsewhere_its_derivative_is_that_of_its_error(seed, roll_rad):
-    """Frame, poses, landmarks and biases, far from where it was made, and upside down; with an absolute part."""
-    _, _, factor = random_summary(some_values(0, roll_rad))
-    values = some_values(seed + 1, roll_rad)
-    found, _ = factor.linearize(values).jacobian()
-    columns = []
-    for key, size in SIZES.items():
-        for i in range(size):
-            ends = [factor.unwhitenedError(moved_by(values, {key: h * np.eye(size)[i]})) for h in (1e-6, -1e-6)]
-            columns.append((ends[0] - ends[1]) / 2e-6)
-    assert found == pytest.approx(np.array(columns).T, abs=1e-7 * np.abs(found).max())
 
 
 def basin_submap(*more: gtsam.NonlinearFactor) -> tuple[Submap, gtsam.Values]:
@@ -92,19 +37,6 @@ def driven_on(values: gtsam.Values) -> gtsam.Values:
     return moved
 
 
-def test_a_turn_about_the_vertical_leaves_the_tilt_as_it_was():
-    """Exactly, from wherever and however far; of the logarithm half of it turns with it."""
-    before = gtsam.Rot3.RzRyRx(0.3, -0.2, 2.0)
-    for tilt in (gtsam.Rot3(), gtsam.Rot3.RzRyRx(0.05, -0.08, 0.1)):
-        after, up = before.compose(tilt), before.matrix()[2]
-        for turn_rad in (-2.0, 0.4):
-            wound = gtsam.Rot3.Rz(turn_rad).compose(after)
-            expected = np.array(turn_from(rows(before), rows(after))[0]) + turn_rad * up
-            assert turn_from(rows(before), rows(wound))[0] == pytest.approx(expected, abs=1e-12)
-    off = gtsam.Rot3.Logmap(before.between(wound)) - gtsam.Rot3.Logmap(before.between(after)) - turn_rad * up
-    assert np.abs(off).max() > 0.01
-
-
 def test_a_submap_that_moves_as_a_whole_stays_exact():
     """Odometry, ranges and azimuths say the same of it anywhere; a fix of a position, once moved, does not.
 
@@ -126,22 +58,6 @@ def test_a_submap_that_moves_as_a_whole_stays_exact():
         scale = np.abs(expected).max()
         assert np.allclose(found[:-1, :-1], expected[:-1, :-1], atol=1e-6 * scale) == is_relative
         assert (factor.error(moved) == pytest.approx(factor.error(values), abs=1e-6)) == is_relative
-
-
-@pytest.mark.parametrize("roll_rad", [0.0, 1.5, 3.0, np.pi])
-def test_yaw_turns_with_a_rotation_whatever_its_attitude(roll_rad):
-    """Upside down as well, where that of the rotation alone is not defined."""
-    start = gtsam.Rot3.RzRyRx(roll_rad, 0.1, 2.0)
-    for tilt in (gtsam.Rot3(), gtsam.Rot3.RzRyRx(0.2, -0.3, 0.0)):
-        R = tilt.compose(start)
-        turned, derivative = yaw_from(rows(start), rows(gtsam.Rot3.Rz(2.5).compose(R)))
-        assert turned - yaw_from(rows(start), rows(R))[0] == pytest.approx(2.5, abs=1e-12)
-        check_derivative(
-            lambda theta: np.array([yaw_from(rows(start), rows(R.retract(theta)))[0]]),  # noqa: B023
-            np.array([yaw_from(rows(start), rows(R))[1]]),
-            np.zeros(3),
-        )
-        assert np.linalg.norm(derivative) < 1.5
 
 
 def test_joined_submaps_are_least_squares():
