@@ -85,6 +85,7 @@ def join(
     from sonar_graph.logs import METADATA, read_images_alone, read_sonar_frames, with_notes, write_amended
 
     path = writable_log(output, images, navigation, overwrite=overwrite)
+    refuse_images(navigation)
     sequence, topic = reading.read(navigation, images=True), reading.choices.get("sonar")
     with as_log(images) as log:
         alone = read_images_alone(log, topic=topic, salvage=reading.salvage)
@@ -112,6 +113,14 @@ def join(
     for note in amended.notes.values():
         echo(f"Not copied: {note}")
     echo(f"Log: {path}\nNext: sonar-graph recognise {path} -o recognised.mcap")
+
+
+def refuse_images(navigation: Path) -> None:
+    """Refuse a navigation that has what would be written."""
+    from sonar_graph.logs.mcap import Keep, scan
+
+    if TOPIC in scan(navigation, lambda _: Keep.NONE).topics:
+        raise LogError(f"{navigation}: has {TOPIC} already; recognise it as it is, or give a log without images")
 
 
 @contextmanager
@@ -165,18 +174,18 @@ def require_overlap(
         return
     apart_s = (sequence.start_ns - first_ns) * 1e-9
     raise LogError(
-        f"{images}: images from {instant(first_ns)} to {instant(last_ns)}; {navigation}: IMU and Doppler log from "
-        f"{instant(sequence.start_ns)} to {instant(sequence.end_ns)}: no common time"
-        f"{f' with an offset of {around_s:+.3f} s' if around_s else ''}; if the clocks differ, state by how much with "
-        f"--offset SECONDS ({apart_s:+.3f} would make both begin together), and --search SECONDS to refine it"
+        f"{images}: {stretch(first_ns, last_ns)}; {navigation}: {stretch(sequence.start_ns, sequence.end_ns)}: "
+        f"no common time{f' with an offset of {around_s:+.3f} s' if around_s else ''}; if clocks differ, give --offset "
+        f"and --search SECONDS ({apart_s:+.3f} makes both begin together)"
     )
 
 
-def instant(stamp_ns: int) -> str:
-    """Seconds of a stamp, and its date where the clock counts since 1970."""
-    seconds = stamp_ns * 1e-9
+def stretch(start_ns: int, end_ns: int) -> str:
+    """Begin and length of a recording; the begin as a date where the clock counts since 1970."""
+    seconds = start_ns * 1e-9
     is_dated = 1e8 < seconds < 1e11
-    return f"{seconds:.3f} s" + (f" ({datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M:%S} UTC)" if is_dated else "")
+    begin = f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M:%S} UTC" if is_dated else f"{seconds:.3f} s"
+    return f"{(end_ns - start_ns) * 1e-9:.0f} s from {begin} on"
 
 
 def offset_of(

@@ -274,7 +274,7 @@ def calibrate(
     few = []
     for name in (*(f"landmark {i}" for i in measured.ids), "no landmark"):
         frames, tracks = (measured.provenance[f"{what} of {name}"] for what in ("frames", "tracks"))
-        answers().print(f"  {name}: {frames} frames, {tracks} tracks")
+        answers().print(f"  {name}: {frames} frame{'s'[frames == '1' :]}, {tracks} track{'s'[tracks == '1' :]}")
         few += [name] if int(tracks) < FEW_TRACKS else []
     interval = measured.report_interval()
     answers().print(

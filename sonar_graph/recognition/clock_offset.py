@@ -141,8 +141,8 @@ def estimate_offset(
     is_covered = counts >= max(LEAST_STEPS, LEAST_SHARE * counts.max())
     if not is_covered.any():
         raise LogError(
-            f"{CANNOT_TELL}: with none within {search_s:g} s of {around_s:+.3f} s do {LEAST_STEPS} steps between them "
-            f"lie within IMU and Doppler log; {AS_STATED}"
+            f"{CANNOT_TELL}: within {search_s:g} s of {around_s:+.3f} s fewer than {LEAST_STEPS} steps between them "
+            f"lie in IMU and Doppler log; {AS_STATED}"
         )
     likely = np.where(is_covered, 0.0, -np.inf)
     most = np.quantile(np.abs(z), CLIPPED_AT, axis=0)
@@ -156,7 +156,7 @@ def estimate_offset(
     best = int(np.argmax(found))
     if best in (0, len(found) - 1):
         raise LogError(
-            f"{CANNOT_TELL}: the likeliest, {offsets_s[best]:+.2f} s, is at the end of the search; search farther with "
+            f"{CANNOT_TELL}: the likeliest, {offsets_s[best]:+.2f} s, is at the end of the search; give a longer "
             f"--search SECONDS, or {AS_STATED}"
         )
     seconds, near = _top(offsets_s, found), np.abs(offsets_s - offsets_s[best]) <= APART_S
@@ -164,8 +164,8 @@ def estimate_offset(
     nats = float(found[best]) - float(found[np.abs(offsets_s - seconds) > APART_S].max(initial=0.0))
     if nats < LEAST_NATS or sigma_s > LARGEST_SIGMA_S:
         raise LogError(
-            f"{CANNOT_TELL}: the likeliest, {seconds:+.2f} s ± {sigma_s:.2f} s, is only exp({nats:.1f}) times as "
-            f"likely as others: the motion hardly changes, or the images show it badly; {AS_STATED}"
+            f"{CANNOT_TELL}: {seconds:+.2f} s ± {sigma_s:.2f} s is only exp({nats:.1f}) times as likely as others "
+            f"(a steady motion, or images that show it badly); {AS_STATED}"
         )
     fitted = _fitted(z, f := moved(seconds))
     ahead, across = (_correlation(z[:, c], fitted[:, c]) for c in range(2))

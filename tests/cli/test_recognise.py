@@ -125,7 +125,7 @@ def test_a_model_that_calibrate_wrote_is_used(lane_log, run, tmp_path, monkeypat
     monkeypatch.setattr(confusion_fit, "LEAST_FRAMES", 8)
     assert run("calibrate", lane_log, "-o", tmp_path / "model.json") == 0
     said = capsys.readouterr().out
-    assert re.search(r"^  landmark 1: \d+ frames, 1 tracks?$", said, re.MULTILINE)
+    assert re.search(r"^  landmark 1: \d+ frames, 1 track$", said, re.MULTILINE)
     assert re.search(r"^Caution: fewer than 10 tracks of landmark 1, .*more logs", said, re.MULTILINE)
     model = read_confusion(tmp_path / "model.json")
     sigmas = f"  range sigma {1e3 * model.range_sigma_m:.1f} mm, azimuth sigma {model.azimuth_sigma_rad:.4f} rad, "
