@@ -277,33 +277,41 @@ class CandidateFit:
         plane, seen = view or SLANT_PLANE, rows[rows >= 0]
         range_m, azimuth_rad = candidates.range_m[seen], candidates.azimuth_rad[seen]
         points_m = plane.floor_points(range_m, azimuth_rad) @ plane.level_R_sonar.T
-        columns = range_m.tolist(), azimuth_rad.tolist(), *points_m.T[:2].tolist()
-        sightings = iter([self._sighting(image_db, view, *row) for row in zip(*columns, strict=True)])
+        bearing_rad, away_m = np.arctan2(points_m[:, 1], points_m[:, 0]), np.hypot(points_m[:, 0], points_m[:, 1])
+        fits = [self._fit(image_db, plane, *row) for row in zip(away_m.tolist(), bearing_rad.tolist(), strict=True)]
+        sightings = iter(self._sightings(view, range_m, azimuth_rad, bearing_rad, fits))
         return [None if row < 0 else next(sightings) for row in rows.tolist()]
 
-    def _sighting(
-        self, image_db: Floats32, view: FloorView | None, range_m: float, azimuth_rad: float, x_m: float, y_m: float
-    ) -> ObjectSighting:
-        """Sighting of a candidate with its centroid at a range and azimuth and a floor point, level x and y.
-
-        Where the best design's centre is; NaN for the floor point: the ray does not reach it.
-        """
+    def _fit(self, image_db: Floats32, plane: FloorView, away_m: float, bearing_rad: float) -> DesignFit | None:
+        """Fit of the designs to what lies at a distance and bearing on the floor; NaN: the ray does not reach it."""
         assert self._grid is not None
-        model, params, fit = self._confusion, self._appearance.params, None
-        if not math.isnan(x_m):
-            ahead = (view or SLANT_PLANE).turned(math.atan2(y_m, x_m))
-            centre_m = np.array([math.hypot(x_m, y_m), 0.0])
-            fit = self._appearance.fit(
-                self._grid.patch(image_db, ahead, centre_m, self._appearance.patch_side, params.cell_m)
-            )
-        if fit is None:
-            covariance = np.diag(np.square([CENTROID_SIGMA_M, CENTROID_SIGMA_M / range_m]))
-            return ObjectSighting(None, range_m, azimuth_rad, covariance)
-        best = int(np.argmax(model.log_odds(fit.evidence)))
-        range_m, azimuth_rad = ahead.range_azimuth(fit.centre_m[best])
-        rise = 0.0 if view is None else view.height_m / range_m
-        covariance, bin_m = model.range_azimuth_cov(fit.visible, self._grid.bin_m), self._grid.bin_m
-        return ObjectSighting(fit, range_m + model.height_bias_m * rise, azimuth_rad, covariance, rise, bin_m)
+        if math.isnan(away_m):
+            return None
+        side, cell_m = self._appearance.patch_side, self._appearance.params.cell_m
+        ahead, centre_m = plane.turned(bearing_rad), np.array([away_m, 0.0])
+        return self._appearance.fit(self._grid.patch(image_db, ahead, centre_m, side, cell_m))
+
+    def _sightings(
+        self, view: FloorView | None, range_m: Floats, azimuth_rad: Floats, bearing_rad: Floats,
+        fits: list[DesignFit | None],
+    ) -> list[ObjectSighting]:  # fmt: skip
+        """Sightings where the centre of the best design is; without a fit where the candidate's centroid is."""
+        assert self._grid is not None
+        model, bin_m, fitted = self._confusion, self._grid.bin_m, [fit for fit in fits if fit is not None]
+        covariance, rise = np.zeros((len(fits), 2, 2)), np.zeros(len(fits))
+        covariance[:, 0, 0], covariance[:, 1, 1] = CENTROID_SIGMA_M**2, (CENTROID_SIGMA_M / range_m) ** 2
+        if fitted:
+            rows = np.flatnonzero([fit is not None for fit in fits])
+            best = np.argmax(model.log_odds(np.array([fit.evidence for fit in fitted])), axis=1)
+            x, y = np.array([fit.centre_m[k] for fit, k in zip(fitted, best.tolist(), strict=True)]).T
+            cos, sin = np.cos(bearing_rad[rows]), np.sin(bearing_rad[rows])
+            level_xy = np.array([cos * x - sin * y, sin * x + cos * y]).T
+            r, azimuth_rad[rows] = (view or SLANT_PLANE).range_azimuth(level_xy)
+            rise[rows] = 0.0 if view is None else view.height_m / r
+            range_m[rows] = r + model.height_bias_m * rise[rows]
+            covariance[rows] = model.range_azimuth_cov(np.array([fit.visible for fit in fitted]), bin_m)
+        columns = fits, range_m.tolist(), azimuth_rad.tolist(), covariance, rise.tolist()
+        return [ObjectSighting(*row, bin_m) for row in zip(*columns, strict=True)]
 
     def log_odds(self, sightings: Sequence[ObjectSighting | None]) -> Floats:
         """Log odds of each design against none of them, last 0 for these, shape (M, designs + 1).

@@ -170,6 +170,8 @@ class Beliefs:
         """Remember the place from which tracks were looked at; of too many of a track the first is forgotten."""
         self._looked = np.append(self._looked, ids)
         self._places = np.vstack([self._places, np.tile(place, (len(ids), 1))])
+        if len(self._looked) <= self.params.most_looks:
+            return
         _, first, count = np.unique(self._looked, return_index=True, return_counts=True)
         if (too_many := first[count > self.params.most_looks]).size:
             self._looked, self._places = np.delete(self._looked, too_many), np.delete(self._places, too_many, axis=0)

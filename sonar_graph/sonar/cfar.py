@@ -21,6 +21,7 @@ from sonar_graph.calibration import Section
 from sonar_graph.devices import LEAST_BRIGHT_DB, LandmarkDesign
 from sonar_graph.errors import CalibrationError, MeasurementError
 from sonar_graph.measurements import Floats, Ints
+from sonar_graph.numerics import compiled
 from sonar_graph.sonar.geometry import FloorView
 from sonar_graph.sonar.regions import Candidates, CandidateVerdict, Floats32, Regions, background_of, measure_regions
 
@@ -162,11 +163,20 @@ def offset_table(false_alarm: float) -> Floats32:
 
 def false_alarm_offsets_db(spreads_db: Floats32, false_alarm: float) -> Floats32:
     """`false_alarm_offset_db` of each, by interpolation to 0.01 dB."""
-    table, first, step = offset_table(false_alarm), np.float32(SPREADS_DB[0]), np.float32(SPREADS_DB[1] - SPREADS_DB[0])
-    place = np.clip((spreads_db - first) / step, 0, len(table) - 1)
-    row = np.minimum(place.astype(np.int32), len(table) - 2)
-    before = table[row]
-    return before + (place - row).astype(np.float32) * (table[row + 1] - before)
+    return interpolated(
+        spreads_db, float(SPREADS_DB[0]), float(SPREADS_DB[1] - SPREADS_DB[0]), offset_table(false_alarm)
+    )
+
+
+@compiled
+def interpolated(values: Floats32, first: float, step: float, table: Floats32) -> Floats32:
+    """A table of what belongs to equally spaced values, looked up for each; its ends beyond it."""
+    found = np.empty_like(values)
+    for n in range(values.size):
+        place = min(max((float(values.flat[n]) - first) / step, 0.0), len(table) - 1.0)
+        row = min(int(place), len(table) - 2)
+        found.flat[n] = table[row] + (place - row) * (table[row + 1] - table[row])
+    return found
 
 
 LEAST_COUNT = 3

@@ -134,14 +134,15 @@ class Confusion(Section):
         """Log odds of each design against none of them, shape (..., designs), from evidence (..., designs, 9)."""
         return np.asarray(evidence @ np.array(self.weights))
 
-    def range_azimuth_cov(self, visible: float, bin_m: float) -> Floats:
-        """Covariance of range and azimuth of a landmark with this share in view, in bins of this length, shape (2, 2).
+    def range_azimuth_cov(self, visible: Floats, bin_m: float) -> Floats:
+        """Covariances of range and azimuth of landmarks with these shares in view, shape (n, 2, 2), in bins so long.
 
         Sigmas grow with the inverse square of the share, as measured on simulated basins. Variances grow with the bins:
         a bin is one look at the speckle, so that a landmark has half as many where bins are twice as long.
         """
         longer = 1.0 if self.bin_m is None else max(bin_m / self.bin_m, 1.0)
-        return np.diag(np.square(np.array([self.range_sigma_m, self.azimuth_sigma_rad]) / visible**2) * longer)
+        variances = np.diag([self.range_sigma_m**2, self.azimuth_sigma_rad**2])
+        return np.asarray(variances * longer / visible[:, None, None] ** 4)
 
     def report_interval(self) -> int:
         """Number of frames of a track that tell as much of a place as one independent frame.

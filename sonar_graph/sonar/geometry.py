@@ -70,7 +70,7 @@ class FloorView:
         """The same view with level axes whose x axis points to this bearing."""
         cos, sin = math.cos(bearing_rad), math.sin(bearing_rad)
         ahead_R_level = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
-        return replace(self, level_R_sonar=ahead_R_level @ self.level_R_sonar)
+        return FloorView(ahead_R_level @ self.level_R_sonar, self.height_m, self.height_sigma_m, self.tilt_sigma_rad)
 
     def floor_points(self, ranges_m: Floats, azimuths_rad: Floats) -> Floats:
         """Points in the sonar frame where rays meet the floor, shape (n, 3); NaN where they do not."""
@@ -85,10 +85,10 @@ class FloorView:
         q = self.floor_points(np.array([range_m]), np.array([azimuth_rad]))[0]
         return None if np.isnan(q[0]) else np.asarray(self.level_R_sonar @ q)[:2]
 
-    def range_azimuth(self, xy_m: Floats) -> tuple[float, float]:
-        """Range and azimuth of a floor point, level (x, y) of shape (2,)."""
-        x, y, z = (self.level_R_sonar.T @ np.array([xy_m[0], xy_m[1], -self.height_m])).tolist()
-        return math.hypot(x, y, z), math.atan2(y, x)
+    def range_azimuth(self, xy_m: Floats) -> tuple[Floats, Floats]:
+        """Ranges and azimuths of floor points, shape (n,), from level (x, y), shape (n, 2)."""
+        x, y, z = (xy_m @ self.level_R_sonar[:2] - self.height_m * self.level_R_sonar[2]).T
+        return np.sqrt(x * x + y * y + z * z), np.arctan2(y, x)
 
     def elevation_sigmas(self, points_m: Floats) -> Floats:
         """Standard deviation of the elevation of floor points, shape (n,), given in the sonar frame, shape (n, 3).

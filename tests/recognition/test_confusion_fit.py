@@ -239,7 +239,9 @@ def test_sigmas_are_root_mean_squares_of_a_landmark_that_is_wholly_in_view():
     assert [model.range_sigma_m, model.azimuth_sigma_rad] == pytest.approx(sigmas, rel=0.05)
     assert partly.range_sigma_m == pytest.approx(0.01, rel=0.15)
     variances = np.nanmean(cut.range_azimuth_error**2, axis=0)
-    np.testing.assert_allclose(np.diag(partly.range_azimuth_cov(0.7, 0.003)), variances * 600 / 599, rtol=1e-9)
+    np.testing.assert_allclose(
+        np.diag(partly.range_azimuth_cov(np.array([0.7]), 0.003)[0]), variances * 600 / 599, rtol=1e-9
+    )
 
 
 def test_longer_bins_have_fewer_looks_and_shorter_ones_are_not_known_to_be_better():
@@ -251,11 +253,11 @@ def test_longer_bins_have_fewer_looks_and_shorter_ones_are_not_known_to_be_bette
     model = confusion_fit.estimate_confusion(mixed, (1, 2), {})
     assert model.bin_m == 0.003
     assert [model.range_sigma_m, model.azimuth_sigma_rad] == pytest.approx((0.01, 0.002), rel=0.1)
-    near, long, short = (model.range_azimuth_cov(0.9, bin_m) for bin_m in (0.003, 0.012, 0.001))
+    near, long, short = (model.range_azimuth_cov(np.array([0.9]), bin_m) for bin_m in (0.003, 0.012, 0.001))
     np.testing.assert_allclose(long, 4 * near)
     np.testing.assert_array_equal(short, near)
     anywhere = model.model_copy(update={"bin_m": None})
-    np.testing.assert_array_equal(anywhere.range_azimuth_cov(0.9, 0.012), near)
+    np.testing.assert_array_equal(anywhere.range_azimuth_cov(np.array([0.9]), 0.012), near)
 
 
 def test_frames_of_a_track_count_together():

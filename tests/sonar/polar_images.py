@@ -26,6 +26,12 @@ ROTATION = level_R_sonar()
 VIEW = FloorView(ROTATION, HEIGHT_M)
 
 
+def polar(xy_m: tuple[float, float]) -> tuple[float, float]:
+    """Range and azimuth of a point of the floor."""
+    (r,), (a,) = VIEW.range_azimuth(np.array([xy_m]))
+    return float(r), float(a)
+
+
 def candidates_at(range_m: list[float], azimuth_rad: list[float], rejected: tuple[int, ...] = ()) -> Candidates:
     """Candidates with these positions and an elevation known to 0.07 rad."""
     zero, verdicts = np.zeros(len(range_m)), np.zeros(len(range_m), dtype=np.int64)

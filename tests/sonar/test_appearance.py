@@ -15,7 +15,7 @@ from sonar_graph.sonar.appearance import CENTROID_SIGMA_M, Appearance, Candidate
 from sonar_graph.sonar.confusion import Confusion, confusion_for
 from sonar_graph.sonar.evidence import BEHIND, EVIDENCE, FAR, NEAR, Figures
 from sonar_graph.sonar.geometry import FloorView
-from sonar_graph.sonar.templates import Patch, PolarGrid, Templates, material_radius_m
+from sonar_graph.sonar.templates import Patch, PolarGrid, Templates, azimuth, material_radius_m
 
 from .polar_images import (
     AZIMUTHS_RAD,
@@ -27,6 +27,7 @@ from .polar_images import (
     floor_points,
     image_db,
     level_R_sonar,
+    polar,
 )
 
 GRID = PolarGrid.of(RANGES_M, AZIMUTHS_RAD)
@@ -341,7 +342,7 @@ def test_a_long_shadow_speaks_against_a_design(appearance):
     shaded = image.copy()
     r, a = np.meshgrid(RANGES_M, AZIMUTHS_RAD)
     x = np.sqrt(np.maximum((r * np.cos(a)) ** 2 + 0 * a, 0))
-    first, last = (VIEW.range_azimuth(np.array([1.7 + d, 0.0]))[0] for d in (0.15, 0.24))
+    first, last = (polar((1.7 + d, 0.0))[0] for d in (0.15, 0.24))
     dark = (r > first) & (r < last) & (np.abs(r * np.sin(a)) < 0.13) & (x > 0)
     shaded[dark] -= 15
     plain, behind = (odds(_fit(appearance, one, (1.7, 0.0)))[1] for one in (image, shaded))
@@ -375,7 +376,7 @@ def look_at(
     aperture_rad: float = APERTURE_RAD,
 ) -> ObjectSighting:
     """A look at a candidate near a point of the floor."""
-    r, a = VIEW.range_azimuth(np.array(near_m))
+    r, a = polar(near_m)
     look = CandidateFit(appearance, model, aperture_rad)
     return look.at(image, frame(image), view, candidates_at([r], [a]), np.array([0]))[0]
 
@@ -387,7 +388,7 @@ def triangle() -> np.ndarray:
 
 def test_range_and_azimuth_are_those_of_the_centre_and_less_certain_where_partly_in_view(appearance, triangle):
     found = look_at(appearance, triangle, (1.725, 0.03))
-    r, a = VIEW.range_azimuth(np.array([1.7, 0.05]))
+    r, a = polar((1.7, 0.05))
     assert odds(found.fit).argmax() == TRIANGLE
     assert (found.range_m, found.azimuth_rad) == (pytest.approx(r, abs=0.006), pytest.approx(a, abs=0.004))
     np.testing.assert_allclose(found.covariance, np.diag([0.01**2, 0.004**2]) / found.fit.visible**4)
@@ -423,13 +424,13 @@ def test_a_face_that_is_higher_than_the_landmarks_place_seems_nearer_by_what_is_
 def test_what_is_not_in_view_is_compared_with_nothing(appearance, triangle, near_m, view, aperture_rad):
     found = look_at(appearance, triangle, near_m, view=view, aperture_rad=aperture_rad)
     assert found.fit is None
-    r, a = VIEW.range_azimuth(np.array(near_m))
+    r, a = polar(near_m)
     assert (found.range_m, found.azimuth_rad) == (r, a)
     np.testing.assert_allclose(found.covariance, np.diag([CENTROID_SIGMA_M**2, (CENTROID_SIGMA_M / r) ** 2]))
 
 
 def test_rows_say_which_candidate_and_odds_are_those_of_the_model(appearance, triangle):
-    r, a = VIEW.range_azimuth(np.array([1.7, 0.05]))
+    r, a = polar((1.7, 0.05))
     look = CandidateFit(appearance, MODEL, APERTURE_RAD)
     candidates = candidates_at([2.05, r], [-0.1, a])
     none, seen, beside = look.at(triangle, frame(triangle), VIEW, candidates, np.array([-1, 1, 0]))
@@ -441,9 +442,33 @@ def test_rows_say_which_candidate_and_odds_are_those_of_the_model(appearance, tr
     assert found[1].argmax() == TRIANGLE
 
 
+def test_candidates_of_one_frame_are_seen_as_each_alone(appearance, triangle):
+    """Of three the middle one is not in view, and its row of the others is not the frame's."""
+    places = [polar(xy) for xy in ((1.7, 0.07), (1.7, 0.75), (1.69, 0.04))]
+    look = CandidateFit(appearance, MODEL.model_copy(update={"height_bias_m": 0.02}), APERTURE_RAD)
+
+    def seen(*of: tuple[float, float]) -> list[ObjectSighting]:
+        return look.at(
+            triangle, frame(triangle), VIEW, candidates_at(*map(list, zip(*of, strict=True))), np.arange(len(of))
+        )
+
+    for one, (other,) in zip(seen(*places), map(seen, places), strict=True):
+        assert (one.fit is None) == (other.fit is None)
+        assert (one.range_m, one.azimuth_rad, one.range_per_height) == pytest.approx(
+            (other.range_m, other.azimuth_rad, other.range_per_height), rel=1e-12
+        )
+        np.testing.assert_array_equal(one.covariance, other.covariance)
+
+
+def test_azimuths_are_those_of_the_arctangent_all_round():
+    angles_rad = np.linspace(-3.14, 3.14, 1001)
+    found = [azimuth(3 * np.cos(a), 3 * np.sin(a)) for a in angles_rad.tolist()]
+    np.testing.assert_allclose(found, angles_rad, atol=1e-7)
+
+
 def test_other_beams_and_bins_are_looked_up_anew(appearance, triangle):
     """A log may change its window on the way: beams the other way round, fewer bins, farther bins."""
-    look, (r, a) = CandidateFit(appearance, MODEL, APERTURE_RAD), VIEW.range_azimuth(np.array([1.7, 0.05]))
+    look, (r, a) = CandidateFit(appearance, MODEL, APERTURE_RAD), polar((1.7, 0.05))
     first, turned, fewer, farther = (
         look.at(image, frame(image, *window), VIEW, candidates_at([r], [a]), np.array([0]))[0].fit.evidence
         for image, *window in (

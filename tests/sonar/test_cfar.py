@@ -17,7 +17,7 @@ from sonar_graph.sonar.geometry import FloorView
 from sonar_graph.sonar.regions import MEDIAN_TO_SIGMA, CandidateVerdict, background_of, measure_regions
 
 from . import polar_images
-from .polar_images import HEIGHT_M, RANGES_M, image_db
+from .polar_images import HEIGHT_M, RANGES_M, image_db, polar
 
 AZIMUTHS_RAD = polar_images.AZIMUTHS_RAD[::-1].copy()
 VIEW = FloorView.from_angles(HEIGHT_M, 0.0, np.radians(30))
@@ -121,7 +121,7 @@ def test_a_plate_is_one_candidate_where_geometry_says(x, y):
     (row,), (flat,) = found.accepted, blind.accepted
     r = found.range_m[row]
     q = VIEW.floor_points(found.range_m[[row]], found.azimuth_rad[[row]])[0]
-    assert (r, found.azimuth_rad[row]) == pytest.approx(VIEW.range_azimuth(np.array([x, y])), abs=0.01)
+    assert (r, found.azimuth_rad[row]) == pytest.approx(polar((x, y)), abs=0.01)
     assert found.area_m2[row] == pytest.approx(0.09, abs=0.02)
     assert found.extent_m[row] == pytest.approx(0.3, abs=0.03)
     assert found.level_db[row] == pytest.approx(PLATE_DB, abs=2.5)

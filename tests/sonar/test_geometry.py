@@ -37,7 +37,7 @@ def test_floor_points_lie_on_the_floor_at_their_range_and_azimuth(height, roll, 
     found_r, found_a, _ = ranges_azimuths_elevations(q)
     assert (found_r[0], found_a[0]) == pytest.approx((r, a), abs=1e-9)
     xy = view.floor_point(r, a)
-    assert view.range_azimuth(xy) == pytest.approx((r, a), abs=1e-9)
+    assert np.hstack(view.range_azimuth(xy[None])) == pytest.approx((r, a), abs=1e-9)
 
 
 def test_a_centre_beam_tilted_down_meets_the_floor_where_the_triangle_says():

@@ -22,7 +22,7 @@ from sonar_graph.sonar.confusion import confusion_for
 from sonar_graph.sonar.recogniser import REPORTED, Recogniser, RecogniserParams, each_once
 from sonar_graph.sonar.track_filter import SonarStep
 
-from .polar_images import AZIMUTHS_RAD, RANGES_M, ROTATION, VIEW, image_db
+from .polar_images import AZIMUTHS_RAD, RANGES_M, ROTATION, VIEW, image_db, polar
 
 DECIBELS = Calibration(sonar=SonarCalibration(image=SonarImage(decibel_span=80.0, full_scale=80.0)))
 FRAME_NS = 200_000_000
@@ -66,7 +66,7 @@ def test_a_landmark_passed_by_is_named_and_lies_where_geometry_says(design: int)
     assert ids.tolist() == [design + 1]
     assert probability[0] > 0.9
     assert last.id_probability.sum() <= 1 + 1e-12
-    r, a = VIEW.range_azimuth(np.array([1.7, -0.2]))
+    r, a = polar((1.7, -0.2))
     errors = np.array([last.range_m[0] - r, last.azimuth_rad[0] - a])
     assert errors @ np.linalg.solve(last.range_azimuth_cov[0], errors) < 13.8  # 0.999 of chi2 with two degrees
     assert np.abs(errors) == pytest.approx([0, 0], abs=0.015)
