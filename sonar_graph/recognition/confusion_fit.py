@@ -6,6 +6,8 @@ evidence and the number of looks to whole tracks, the confusion matrix, and the 
 Derivation: docs/theory/recognition.md.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -98,6 +100,23 @@ class LabelledSightings:
             (fit.evidence, fit.visible, row, track, news, error, sighting.range_per_height, sighting.bin_m)
         )
 
+    def add_frame(self, recogniser: Recogniser, run: Run, log: int) -> None:
+        """Add what a recogniser saw in its last frame, of a log with truth; nothing at times that the truth lacks."""
+        stamp_ns, truth = recogniser.stamp_ns, run.true_poses
+        assert truth is not None
+        assert run.true_landmarks is not None
+        if stamp_ns is None or not truth.stamps_ns[0] <= stamp_ns <= truth.stamps_ns[-1]:
+            return
+        range_m, azimuth_rad = true_ranges_azimuths(run, stamp_ns)
+        tracks = zip(recogniser.track_ids.tolist(), recogniser.news.tolist(), recogniser.sightings, strict=True)
+        for track, news, sighting in tracks:
+            if sighting is not None:
+                self.add(sighting, (log, track), news, run.true_landmarks.ids, range_m, azimuth_rad)
+
+    def extend(self, other: LabelledSightings) -> None:
+        """Add all sightings of other logs, with the same designs."""
+        self._rows += other._rows
+
     def fits(self) -> LabelledFits:
         """All of them as columns."""
         columns = zip(*self._rows, strict=True) if self._rows else [()] * 8
@@ -170,8 +189,7 @@ def calibrate(
     designs = tuple(designs or DEFAULT_DESIGNS)
     gathered = LabelledSightings(tuple(design.id for design in designs))
     for log, (path, run) in enumerate(logs):
-        truth = run.true_poses
-        if truth is None or run.true_landmarks is None:
+        if run.true_poses is None or run.true_landmarks is None:
             raise CalibrationError(f"{path}: without true poses and true landmarks nothing in it can be labelled")
         in_log = run.true_landmarks.ids.tolist()
         if not set(gathered.ids) & set(in_log):
@@ -183,13 +201,8 @@ def calibrate(
         recogniser = Recogniser(run.calibration, designs, params)
         session = RecognitionSession(run, recogniser=recogniser, pictures=False)
         for stamp_ns in session.run(read_sonar_frames(path, topic, config, salvage=salvage)):
-            if recogniser.stamp_ns != stamp_ns or not truth.stamps_ns[0] <= stamp_ns <= truth.stamps_ns[-1]:
-                continue
-            range_m, azimuth_rad = true_ranges_azimuths(run, stamp_ns)
-            tracks = zip(recogniser.track_ids.tolist(), recogniser.news.tolist(), recogniser.sightings, strict=True)
-            for track, news, sighting in tracks:
-                if sighting is not None:
-                    gathered.add(sighting, (log, track), news, run.true_landmarks.ids, range_m, azimuth_rad)
+            if recogniser.stamp_ns == stamp_ns:
+                gathered.add_frame(recogniser, run, log)
         if not session.result.frames:
             raise LogError(no_images(path))
     names = spelt(", ".join(path.name for path, _ in logs))

@@ -96,3 +96,8 @@ def test_the_motion_of_images_tells_the_offset(lane):
     found = estimated(lane, seen, -0.8)
     assert abs(found.seconds + 0.8) < 3 * found.sigma_s + 0.01
     assert min(found.correlations) > 0.9
+
+
+def test_an_offset_between_those_that_are_tried_is_found_to_a_tenth_of_their_distance(lane, steps):
+    off_s = [estimated(lane, steps, 1.37 + d, around_s=1.4, search_s=1.5).seconds - d for d in (0.0, 0.006)]
+    assert off_s[1] == pytest.approx(off_s[0], abs=0.002)

@@ -223,6 +223,23 @@ def some(fits: confusion_fit.LabelledFits, rows: np.ndarray) -> confusion_fit.La
     return confusion_fit.LabelledFits(*(column[rows] for column in vars(fits).values()))
 
 
+def test_a_track_counts_once_for_the_height_however_long_it_is_watched():
+    """Two landmarks, 1 and 3 cm higher than their places; the second is watched for ten frames as long."""
+    fits = some(_fits(20, 0.1), np.array([0, *[1] * 10]))
+    off = np.array([-0.01, *[-0.03] * 10])
+    fits = replace(fits, range_azimuth_error=np.column_stack([off, 0 * off]), range_per_height=np.ones(11))
+    assert confusion_fit.without_height(fits)[0] == pytest.approx(0.02)
+
+
+def test_landmarks_and_others_count_by_the_prior_however_many_tracks_there_are_of_each():
+    """40 tracks of landmarks and 4 of others, and one that was never seen from a new place, which is none."""
+    fits = some(_fits(20, 0.1), np.arange(45))
+    _, _, label, share = confusion_fit.track_sums(replace(fits, news=np.arange(45) > 0))
+    unknown = IdentityParams().unknown_prior
+    assert len(label) == 44
+    assert [share[label < 2].sum(), share[label == 2].sum()] == pytest.approx([44 * (1 - unknown), 44 * unknown])
+
+
 def test_a_class_with_too_few_frames_is_named():
     with pytest.raises(CalibrationError, match="no landmark: 5"):
         confusion_fit.estimate_confusion(some(_fits(100, 0.1), np.arange(205)), (1, 2), {})
@@ -287,3 +304,9 @@ def test_the_correlation_of_errors_is_that_of_successive_frames_of_a_track(rho):
     of = np.array(track)
     assert confusion_fit.error_correlation(np.array(error) * [1e-3, 4e-4], of) == pytest.approx(rho, abs=0.03)
     assert confusion_fit.error_correlation(np.full((len(order), 2), np.nan), of) == 0.0
+
+
+def test_a_track_seen_backwards_has_the_same_correlation():
+    error = np.outer([1.0, 0.5, 0.25, 0.1], [1e-3, 4e-4])
+    there, back = (confusion_fit.error_correlation(e, np.zeros(4, dtype=int)) for e in (error, error[::-1]))
+    assert 0 < there == pytest.approx(back)

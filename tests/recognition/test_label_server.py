@@ -136,6 +136,15 @@ def test_each_click_is_saved_and_can_be_taken_back(server, tmp_path):
     assert [label.id for label in read_labels(tmp_path / "labels.json", Path("lane.mcap")).labels] == [2]
 
 
+def test_the_last_label_of_a_frame_is_taken_back(server):
+    desk = server.desk
+    column, row = desk.frames[1].fan.pixel(1.8, 0.0)
+    for landmark in (2, 3, 1):
+        assert desk.add(1, column, row, landmark) is None
+    assert desk.take_back(1) is None
+    assert [label.id for label in desk.labels] == [2, 3]
+
+
 def test_what_cannot_be_saved_is_said_and_not_kept(server, monkeypatch):
     def full(*_: object) -> None:
         raise OSError("no space left")

@@ -268,6 +268,19 @@ def test_evidence_is_that_of_least_squares_over_the_cells_in_view(appearance, ri
     assert has == {*EVIDENCE} - ({"bare"} if figures.has_dark.all() else set())
 
 
+@pytest.mark.parametrize("width", [11, 23])
+def test_zones_of_which_only_a_few_cells_are_in_view_say_nothing(appearance, width: int):
+    """Only the middle is in view: at its rim lie the first cells next to the figure, behind it, or farther out."""
+    templates, figures, rng = appearance.templates, appearance.figures, np.random.default_rng(width)
+    side = appearance.patch_side
+    inside = np.abs(np.arange(side) - side // 2) <= width // 2
+    seen = (inside[:, None] & inside).astype(np.float32)
+    for template in range(len(templates.design)):
+        patch = Patch.of(rng.normal(40, 4, (side, side)).astype(np.float32) * seen, seen, np.zeros(2))
+        (found,) = figures.evidence(patch, np.array([template]), np.array([[3, 2]]))
+        np.testing.assert_allclose(found[4:7], plain_evidence(figures, template, 3, 2, patch)[4:7], atol=2e-3)
+
+
 def test_gain_and_floor_level_change_nothing(appearance):
     """Decibels are as the sonar's gain lifts them; the heading of a triangle is found up to its symmetry."""
     image = image_db(DEFAULT_DESIGNS[2], (1.7, 0.0), 0.4, ROTATION, np.random.default_rng(0))

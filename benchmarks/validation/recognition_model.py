@@ -1,0 +1,155 @@
+"""Measure a model of recognition as the one that ships was, and compare both in basins that were left out.
+
+    python benchmarks/validation/recognition_model.py -o MODEL.json
+
+Basins of one lap in 200 s, 3 frames a second, two unknown objects beside each landmark, and conditions that follow from
+the seed alone (`conditions_of`). Seeds 3001 to 3040 and 3210 to 3218 have all conditions at random, 3121 to 3123 long
+windows (1.5 frames a second), 3201 to 3209 one or two conditions each. Accuracy and its correlation are of seeds 1001
+to 1004 as the basin is, three laps in 390 s, 5 frames a second. The fit is that of `sonar-graph calibrate`, about the
+weights that ship.
+
+* `named`: share of the tracks of landmarks that end with a posterior of one half or more for the right one;
+* `accepted`: the same for any landmark, of the tracks of other things;
+
+each of every fifth basin, by weights fitted to the others, and by those that ship. It passes when at most 1 in 20 other
+things is accepted.
+"""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+from common import conclude, in_parallel, make_parser, print_table
+
+from sonar_graph.devices import DEFAULT_DESIGNS
+from sonar_graph.recognition.confusion_fit import LabelledSightings, estimate_confusion, fit_weights, track_sums
+from sonar_graph.recognition.session import RecognitionSession, one_by_one
+from sonar_graph.simulation import BasinOptions, simulate_basin, simulate_basin_frames
+from sonar_graph.simulation.sonar_image import ImageOptions
+from sonar_graph.sonar import SHIPPED, IdentityParams, Recogniser, read_confusion
+from sonar_graph.sonar.bayes import bounded_evidence
+
+RANDOM, WINDOWS_M, MILD = (*range(3001, 3041), *range(3210, 3219)), {3121: 8.0, 3122: 9.5, 3123: 5.0}, range(3201, 3210)
+ACCURACY = range(1001, 1005)
+IDS = tuple(design.id for design in DEFAULT_DESIGNS)
+FOLDS, ACCEPTED, MOST_ACCEPTED = 5, 0.5, 0.05
+ACCURACY_FIELDS = ("range_sigma_m", "azimuth_sigma_rad", "bin_m", "height_bias_m", "error_correlation")
+
+
+def conditions_of(seed: int) -> dict[str, Any]:
+    """Conditions of the scene of a seed, strangers apart."""
+    rng = np.random.default_rng([seed, 20])
+    drawn = {
+        "contrast_db": rng.uniform(-6.5, 1.0),
+        "plate_db": rng.choice([-8.0, rng.uniform(-8.0, 0.0), 0.0]),
+        "foam_height_m": rng.choice([0.0, 0.012]),
+        "sediment": rng.choice([0.0, rng.uniform(0.0, 0.3)]),
+        "fouling": rng.choice([0.0, rng.uniform(0.0, 0.3)]),
+        "texture_shape": np.exp(rng.uniform(np.log(1.2), np.log(8.0))),
+        "ripple_height_m": rng.choice([0.0, rng.uniform(0.0, 0.012)]),
+        "noise_db": rng.uniform(12.0, 24.0),
+        "attitude_error_deg": rng.uniform(0.0, 0.7),
+        "altitude_error_m": rng.uniform(0.0, 0.02),
+    }
+    if seed in RANDOM:
+        return {name: float(value) for name, value in drawn.items()}
+    if seed in WINDOWS_M:
+        return {"window_m": WINDOWS_M[seed], "contrast_db": float(drawn["contrast_db"])}
+    few = ("contrast_db", "plate_db", "foam_height_m", "sediment", "fouling")
+    return {few[k]: float(drawn[few[k]]) for k in {seed % 5, seed // 2 % 5}} if seed in MILD else {}
+
+
+def sightings_of(seed: int) -> LabelledSightings:
+    """What the recogniser sees in the basin of a seed, labelled by the truth."""
+    known = conditions_of(seed)
+    if known:
+        rate_hz = 1.5 if "window_m" in known else 3.0
+        image = ImageOptions.model_validate({"strangers": ["natural", "look-alikes"]} | known)
+        options = BasinOptions(duration_s=200.0, laps=1, seed=seed, frame_rate_hz=rate_hz, image=image)
+    else:
+        options = BasinOptions(duration_s=390.0, seed=seed, frame_rate_hz=5.0, image=ImageOptions())
+    sequence, found = simulate_basin(options), LabelledSightings(IDS)
+    recogniser = Recogniser(sequence.calibration)
+    session = RecognitionSession(sequence, recogniser=recogniser, pictures=False)
+    for block in simulate_basin_frames(options):
+        for frame in one_by_one(block.frames):
+            session.take(frame)
+            if recogniser.stamp_ns == int(frame.stamps_ns[0]):
+                found.add_frame(recogniser, sequence, seed)
+    return found
+
+
+@dataclass
+class Tally:
+    """Tracks of landmarks and of other things, and how many were named rightly, or accepted."""
+
+    landmarks: int = 0
+    named: int = 0
+    others: int = 0
+    accepted: int = 0
+
+    def count(self, found: LabelledSightings, weights: np.ndarray, looks: float, doubt: float) -> None:
+        """Add the ends of all tracks."""
+        sums, counted, label, _ = track_sums(found.fits())
+        odds = np.pad(sums @ weights, ((0, 0), (0, 1)))
+        belief = bounded_evidence(IdentityParams().birth(len(IDS)), odds, counted, looks, doubt)
+        best, is_known = np.argmax(belief, axis=1), label < len(IDS)
+        is_accepted = (best < len(IDS)) & (belief.max(axis=1) >= ACCEPTED)
+        self.landmarks += int(is_known.sum())
+        self.named += int((is_accepted & (best == label)).sum())
+        self.others += int((~is_known).sum())
+        self.accepted += int((is_accepted & ~is_known).sum())
+
+
+def together(parts: list[LabelledSightings]) -> LabelledSightings:
+    """All sightings of several basins."""
+    found = LabelledSightings(IDS)
+    for part in parts:
+        found.extend(part)
+    return found
+
+
+def main() -> None:
+    parser = make_parser(__doc__, workers=True)
+    parser.add_argument("-o", "--output", type=Path, metavar="MODEL.json", help="write the model")
+    parser.add_argument("--every", type=int, default=1, metavar="N", help="only one in N of the basins")
+    arguments = parser.parse_args()
+    chosen = [*RANDOM, *WINDOWS_M, *MILD][:: 30 if arguments.quick else arguments.every]
+    parts = in_parallel(sightings_of, chosen, arguments.workers, "basin")
+    shipped = read_confusion(SHIPPED)
+    anew, as_shipped = Tally(), Tally()
+    for fold in range(FOLDS):
+        weights, looks = fit_weights(
+            together([part for k, part in enumerate(parts) if k % FOLDS != fold]).fits(),
+            np.array(shipped.weights),
+            shipped.looks,
+        )
+        if left_out := parts[fold::FOLDS]:
+            anew.count(together(left_out), weights, looks, shipped.doubt)
+            as_shipped.count(together(left_out), np.array(shipped.weights), shipped.looks, shipped.doubt)
+    model = estimate_confusion(together(parts).fits(), IDS, {"basins": ", ".join(map(str, chosen))}, DEFAULT_DESIGNS)
+    plain = in_parallel(sightings_of, list(ACCURACY)[: 1 if arguments.quick else None], arguments.workers, "accuracy")
+    accuracy = estimate_confusion(together(plain).fits(), IDS, {}, DEFAULT_DESIGNS)
+    model = model.model_copy(update={name: getattr(accuracy, name) for name in ACCURACY_FIELDS})
+    if arguments.output is not None:
+        arguments.output.write_text(model.model_dump_json(indent=2) + "\n", encoding="utf-8")
+    print_table(
+        ("", "landmarks", "named", "others", "accepted"),
+        [(name, *vars(tally).values()) for name, tally in (("anew", anew), ("as shipped", as_shipped))],
+    )
+    values = [
+        ("looks", model.looks, shipped.looks),
+        *((n, getattr(model, n), getattr(shipped, n)) for n in ACCURACY_FIELDS),
+    ]
+    values += [(f"weight {k}", *pair) for k, pair in enumerate(zip(model.weights, shipped.weights, strict=True))]
+    print_table(("", "anew", "shipped"), [(name, *(f"{value:.5g}" for value in pair)) for name, *pair in values])
+    figures = {"basins": len(parts), "anew": vars(anew), "as_shipped": vars(as_shipped)}
+    conclude(figures | {"passed": anew.accepted <= MOST_ACCEPTED * anew.others}, is_quick=arguments.quick)
+
+
+if __name__ == "__main__":
+    main()
