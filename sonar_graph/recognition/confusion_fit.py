@@ -249,11 +249,20 @@ def estimate_confusion(
         azimuth_sigma_rad=float(sigmas[1]),
         bin_m=bin_m,
         height_bias_m=height_bias_m,
+        roughness=roughness_of_tracks(fits),
         error_correlation=error_correlation(error, fits.track),
         provenance=provenance
         | {f"frames of {n}": str(c) for n, c in zip(names, counts.tolist(), strict=True)}
         | {f"tracks of {n}": str(c) for n, c in zip(names, tracks.tolist(), strict=True)},
     )
+
+
+def roughness_of_tracks(fits: LabelledFits) -> tuple[float, float]:
+    """`Confusion.roughness`: the range of all but one in twenty tracks."""
+    beyond = fits.evidence[:, :, EVIDENCE.index("beyond")].mean(axis=1)
+    means = [beyond[fits.track == track].mean() for track in np.unique(fits.track)]
+    low, high = np.quantile(means, [0.025, 0.975]).tolist()
+    return low, high
 
 
 def without_height(fits: LabelledFits) -> tuple[float, Floats]:

@@ -56,6 +56,8 @@ class Recognition:
     """Spread evenly over the run."""
     notes: dict[str, str] = field(default_factory=dict)
     """Model and settings."""
+    unlike: tuple[int, int] = 0, 0
+    """Number of tracks whose surroundings are rougher or smoother than `Confusion.roughness`, and of all."""
 
     def warned(self) -> dict[str, int]:
         """Count of warnings by reason, most frequent first."""
@@ -85,6 +87,12 @@ class Recognition:
             if unknown:
                 listed = ", ".join(map(str, unknown))
                 lines.append(f"Warning: the log has landmarks {listed}, of which there is no design; give --designs")
+        outside, tracks = self.unlike
+        if tracks >= FEWEST_TRACKS and 2 * outside > tracks:
+            lines.append(
+                f"Warning: {outside} of {tracks} tracks lie on a floor rougher or smoother than where the model was "
+                "measured (1 in 20 is usual): check sonar.image (scale, decibel_span, full_scale), or use `calibrate`"
+            )
         if (line := self.unlike_the_model()) is not None:
             lines += [line, SEE_TRACKS]
         return lines

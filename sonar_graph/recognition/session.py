@@ -28,7 +28,7 @@ from sonar_graph.recognition.image_motion import ImageMotions, MotionFrom
 from sonar_graph.recognition.recognition_record import DrawnFrame, Recognition, as_jpeg, draw_fan
 from sonar_graph.recognition.sonar_motion import SonarMotions
 from sonar_graph.sequence import Sequence as Run
-from sonar_graph.sonar import Fan, Fate, FloorView, Recogniser, RecogniserParams, SonarStep, with_lens
+from sonar_graph.sonar import EVIDENCE, Fan, Fate, FloorView, Recogniser, RecogniserParams, SonarStep, with_lens
 
 MOST_PICTURES = 400
 MOST_WARNINGS = 200
@@ -235,6 +235,8 @@ class RecognitionSession:
         else:
             self._motions = ImageMotions(sequence.calibration, is_fixed=motion == "fixed")
         self._blocks: list[LandmarkDetections] = []
+        self._beyond: dict[int, tuple[float, int]] = {}
+        """Sum of the evidence `beyond` of each track, and number of its frames."""
         self._fan: Fan | None = None
         self._fan_of: tuple[object, object] = (None, None)
         self._picture_period_ns = PICTURE_PERIOD_NS
@@ -272,6 +274,12 @@ class RecognitionSession:
                 self.result.outcomes[fate.outcome] += 1
         if found is not None:
             self._blocks.append(found)
+        if isinstance(self.recogniser, Recogniser):
+            for track, sighting in zip(self.recogniser.track_ids.tolist(), self.recogniser.sightings, strict=True):
+                if sighting is not None and sighting.fit is not None:
+                    total, count = self._beyond.get(track, (0.0, 0))
+                    beyond = float(sighting.fit.evidence[:, EVIDENCE.index("beyond")].mean())
+                    self._beyond[track] = total + beyond, count + 1
         if self._seen is not None and is_used:
             self._seen(frame)
         if self._draws and is_used:
@@ -290,6 +298,9 @@ class RecognitionSession:
         result.notes = {"detections": f"recognised in {result.frames} sonar images"} | self.recogniser.notes()
         if isinstance(self._motions, ImageMotions):
             result.notes |= self._motions.notes()
+        if isinstance(self.recogniser, Recogniser) and (usual := self.recogniser.confusion.roughness) is not None:
+            means = [total / count for total, count in self._beyond.values()]
+            result.unlike = sum(not usual[0] <= mean <= usual[1] for mean in means), len(means)
         result.outcomes = +result.outcomes  # drops zero counts
         result.warnings.sort(key=lambda row: row[0])
         if result.warnings:

@@ -71,6 +71,8 @@ class Confusion(Section):
     """How much each column of `EVIDENCE` counts, in nats."""
     looks: float = Field(gt=0, allow_inf_nan=False)
     """Number of independent looks that give a track half of the log odds of endless ones."""
+    roughness: tuple[float, float] | None = None
+    """2.5 and 97.5 % quantiles, over tracks, of their mean evidence `beyond`; None: not measured."""
     doubt: float = Field(5e-4, ge=0, lt=1)
     """Share of tracks whose looks tell nothing: what was never seen in n tracks may still happen in 1 / 2n of them."""
     range_sigma_m: float = Field(gt=0, allow_inf_nan=False)

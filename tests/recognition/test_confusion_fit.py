@@ -310,3 +310,11 @@ def test_a_track_seen_backwards_has_the_same_correlation():
     error = np.outer([1.0, 0.5, 0.25, 0.1], [1e-3, 4e-4])
     there, back = (confusion_fit.error_correlation(e, np.zeros(4, dtype=int)) for e in (error, error[::-1]))
     assert 0 < there == pytest.approx(back)
+
+
+def test_roughness_is_the_range_of_all_but_one_track_in_twenty_however_long_they_are():
+    fits = _fits(67, 0.1)
+    level = np.arange(201) / 10
+    fits.evidence[..., EVIDENCE.index("beyond")] = level[:, None]
+    low, high = confusion_fit.roughness_of_tracks(some(fits, np.append(np.arange(201), [200] * 50)))
+    assert [low, high] == pytest.approx([0.5, 19.5])

@@ -49,3 +49,12 @@ def test_nothing_of_an_earlier_recognition_is_left(recognition: Recognition, tmp
         write_recognition(None if pictures is None else replace(recognition, pictures=pictures), tmp_path)
         assert [path.name for path in tmp_path.glob("recognised/*")] == files
     assert read_recognition(tmp_path) is None
+
+
+@pytest.mark.parametrize(
+    ("unlike", "is_doubted"), [((6, 10), True), ((5, 10), False), ((9, 9), False), ((0, 0), False)]
+)
+def test_a_floor_of_another_roughness_is_told_where_most_of_ten_tracks_show_it(recognition, unlike, is_doubted):
+    lines = [line for line in replace(recognition, unlike=unlike).naming() if "rougher or smoother" in line]
+    assert len(lines) == is_doubted
+    assert all(line.startswith("Warning: 6 of 10 tracks") for line in lines)

@@ -283,3 +283,14 @@ def test_the_lens_of_the_calibration_puts_azimuths_right(lane, lens, is_right):
     named = errors[found.most_probable()[0] == ids, 1]
     assert len(named) > 40
     assert (np.degrees(np.median(np.abs(named))) < 0.1) == is_right
+
+
+def test_tracks_on_a_rougher_or_smoother_floor_than_the_models_are_counted(lane):
+    shipped = confusion_for(DEFAULT_DESIGNS)
+    counts = []
+    for roughness in (None, (-20.0, 20.0), (-20.0, -10.0), (10.0, 20.0)):
+        params = RecogniserParams(confusion=shipped.model_copy(update={"roughness": roughness}))
+        counts.append(recognise_images([lane.frames], lane.sequence, params=params).unlike)
+    tracks = counts[1][1]
+    assert tracks > 0
+    assert counts == [(0, 0), (0, tracks), (tracks, tracks), (tracks, tracks)]
