@@ -43,11 +43,12 @@ Overwrite = Annotated[
 ]
 OutputFolder = Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Folder to write to.")]
 RateHz = Annotated[
-    float,
+    float | None,
     typer.Option(
         min=1e-3,
         max=1e3,
-        help="How often every estimator is asked for its estimate; at most as often as the IMU measures.",
+        help="How often every estimator is asked for its estimate; at most as often as the IMU measures. "
+        "Default: 2, or of the record of a live run as often as then.",
     ),
 ]
 EstimatorSettings = Annotated[

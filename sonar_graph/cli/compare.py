@@ -64,7 +64,7 @@ def run(
     output: OutputFolder,
     reading: ReadingOptions,
     estimator: Annotated[str, typer.Option("--estimator", help="Name of an installed estimator.")] = "isam2",
-    rate_hz: RateHz = DEFAULT_RATE_HZ,
+    rate_hz: RateHz = None,
     settings: EstimatorSettings = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -89,7 +89,7 @@ def compare(
     recognition: RecogniserOptions,
     reading: ReadingOptions,
     estimators: Annotated[str, typer.Option(help="Names of installed estimators, with commas.")] = DEFAULT_ESTIMATORS,
-    rate_hz: RateHz = DEFAULT_RATE_HZ,
+    rate_hz: RateHz = None,
     settings: EstimatorSettings = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -206,7 +206,7 @@ def compared(
     names: list[str],
     reading: ReadingOptions,
     recognition: RecogniserOptions,
-    rate_hz: float,
+    rate_hz: float | None,
     settings: list[str] | None,
     *,
     overwrite: bool,
@@ -237,18 +237,19 @@ def compare_log(
     overrides: dict[str, dict[str, Any]],
     reading: ReadingOptions,
     recognition: RecogniserOptions,
-    rate_hz: float,
+    rate_hz: float | None,
 ) -> Comparison:
     """Read a log, recognise landmarks if it needs that, and compare estimators."""
     from sonar_graph.diagnosis import doubts
     from sonar_graph.evaluation import compare as compare_runs
     from sonar_graph.evaluation import expense
-    from sonar_graph.logs import no_images
+    from sonar_graph.logs import LIVE_RATE, no_images
     from sonar_graph.logs.adapters import LogConfig
     from sonar_graph.recognition import with_detections
 
     with progress_bars() as progress:
         sequence = reading.read(log, progress=partial(progress, f"reading {log.name}"))
+    rate_hz = rate_hz or float(sequence.notes.get(LIVE_RATE, DEFAULT_RATE_HZ))
     check_rate(rate_hz, sequence)
     if doubted := doubts(sequence, reading.config or LogConfig()):
         said = "; ".join(f"{one.quantity}: {one.text()}" for one in doubted)

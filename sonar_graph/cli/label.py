@@ -12,7 +12,7 @@ import typer
 from sonar_graph.cli.arguments import DesignsPath, LogPath, Overwrite, ReadingOptions, echo, with_options
 from sonar_graph.cli.outputs import progress_bars, writable_json
 from sonar_graph.errors import LogError
-from sonar_graph.files import until_interrupted
+from sonar_graph.files import interrupt_event
 
 if TYPE_CHECKING:
     from sonar_graph.devices import LandmarkDesign
@@ -86,7 +86,9 @@ def serve(server: LabelServer, log: Path, path: Path, labels: Labels, *, is_show
         webbrowser.open(server.address)
     serving = Thread(target=server.serve_forever, daemon=True)
     serving.start()
-    until_interrupted()
+    with interrupt_event() as ended:
+        while not ended.wait(0.1):
+            pass
     server.shutdown()
     echo(f"\nLabels: {path} ({len(server.desk.labels)})")
     echo(f"Next: sonar-graph calibrate {log} --labels {path} -o model.json")

@@ -21,6 +21,7 @@ from sonar_graph.cli.convert_data import datasets
 from sonar_graph.cli.inspect_log import inspect
 from sonar_graph.cli.join import join
 from sonar_graph.cli.label import label
+from sonar_graph.cli.live import live, play
 from sonar_graph.cli.recognise import calibrate, recognise
 from sonar_graph.cli.simulate import worlds
 from sonar_graph.errors import SonarGraphError
@@ -73,6 +74,10 @@ app.command(
         "sonar-graph calibrate dive.mcap --labels labels.json -o model.json",
     )
 )(calibrate)
+app.command(
+    epilog=examples("sonar-graph live -o dive", "sonar-graph live -o dive --calibration vehicle.toml --foxglove 8765")
+)(live)
+app.command(epilog=examples("sonar-graph play dive.mcap", "sonar-graph play dive.mcap --rate 3"))(play)
 app.command(epilog=examples("sonar-graph report comparison"))(report)
 app.command(epilog=examples("sonar-graph estimators"))(estimators)
 app.command(epilog=examples("sonar-graph demo -o demo"))(demo)

@@ -3,8 +3,8 @@
 # fmt: off
 from sonar_graph.files.inputs import as_path, read_json, regular, spelt, strict_json, text_of
 from sonar_graph.files.interrupts import (
-    INTERRUPTED, deferred_interrupt, end_at_once, loading, noticed_interrupts, terminations_as_interrupts,
-    until_interrupted,
+    INTERRUPTED, deferred_interrupt, end_at_once, interrupt_event, loading, noticed_interrupts,
+    terminations_as_interrupts,
 )
 from sonar_graph.files.own_process import READY, KilledError, OwnProcess, Tell, serve
 from sonar_graph.files.result_folder import (
@@ -14,8 +14,8 @@ from sonar_graph.files.result_folder import (
 
 __all__ = [
     "BATCH", "COMPARISON", "DIGEST_DIGITS", "INTERRUPTED", "KilledError", "LOCK", "MANIFEST", "OwnProcess", "READY",
-    "Tell", "as_path", "changed_in", "deferred_interrupt", "end_at_once", "kind_of", "loading",
+    "Tell", "as_path", "changed_in", "deferred_interrupt", "end_at_once", "interrupt_event", "kind_of", "loading",
     "noticed_interrupts", "others_in", "read_json", "regular", "remove_written", "replacing", "result_folder",
-    "result_written", "serve", "spelt", "strict_json", "terminations_as_interrupts", "text_of", "until_interrupted",
+    "result_written", "serve", "spelt", "strict_json", "terminations_as_interrupts", "text_of",
     "write_json", "write_manifest", "written_whole",
 ]

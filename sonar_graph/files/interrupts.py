@@ -52,12 +52,21 @@ def noticed_interrupts() -> Iterator[Callable[[], None]]:
         yield check
 
 
-def until_interrupted() -> None:
-    """Wait for a Ctrl-C, which is then no error: it is how the user ends what has no end."""
+@contextmanager
+def interrupt_event() -> Iterator[threading.Event]:
+    """Event that a Ctrl-C or SIGTERM of the block sets, which is then no error: it ends what has no end.
+
+    Also in a process that a script began in the background, where Ctrl-C is otherwise ignored.
+    """
     ended = threading.Event()
-    with _handling(lambda *_: ended.set()):
-        while not ended.wait(0.1):
-            pass
+    is_main = threading.current_thread() is threading.main_thread()
+    signals = (signal.SIGINT, signal.SIGTERM) if is_main else ()
+    before = {number: signal.signal(number, lambda *_: ended.set()) for number in signals}
+    try:
+        yield ended
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @contextmanager

@@ -43,6 +43,7 @@ from sonar_graph.logs.checks import (
     stuck_warning,
 )
 from sonar_graph.logs.geodesy import Origin
+from sonar_graph.logs.live_record import leave_out_dropped, recorded_config
 from sonar_graph.logs.mcap import Keep, Progress, Recording, TimeWindow, scan, stream
 from sonar_graph.logs.roles import ROLES, SEQUENCE_ROLES, SONAR, Choice, choose_topics, wanted_types
 from sonar_graph.logs.vehicle_setup import (
@@ -56,7 +57,7 @@ from sonar_graph.logs.vehicle_setup import (
     recorded_name,
     static_frames,
 )
-from sonar_graph.measurements import Block, Dvl, Imu
+from sonar_graph.measurements import Block, Dvl, Floats, Imu
 from sonar_graph.sequence import Sequence
 
 FOUND_ANEW = frozenset({"log.warnings", "log.gaps", "log.noise", "log.sensors"})
@@ -149,12 +150,12 @@ def read_log(
     path = as_path(path, "read_log(path)")
     if not isinstance(calibration, Calibration | PartialCalibration | None):
         calibration = PartialCalibration.read(as_path(calibration, "read_log(path, calibration=FILE or Calibration)"))
-    config = config or LogConfig()
-    types = wanted_types(config)
-    recording = scan(path, lambda kind: Keep.ALL if short_name(kind) in types else Keep.NONE, window, progress)
+    recording, config = _scanned(path, config, window, progress)
     if not salvage:
         recording.require_sound()
+    left_out = leave_out_dropped(recording)
     sequence = Assembly(recording, choose_topics(recording, topics or {}, config), calibration).sequence(name)
+    sequence.notes.update(left_out)
     if window is not None and window.start is not None and recording.beginning_ns is not None:
         late_ns = window.start.resolve(recording.beginning_ns) - recording.beginning_ns
         given = calibration.values if isinstance(calibration, PartialCalibration) else {}
@@ -165,6 +166,19 @@ def read_log(
                 "read; give the pose there as [start] position_m and rpy_rad in a file for --calibration"
             )
     return sequence
+
+
+def _scanned(
+    path: Path, config: LogConfig | None, window: TimeWindow | None, progress: Progress | None
+) -> tuple[Recording, LogConfig]:
+    """The messages of a log that may be needed, and the description of its topics: the given one, or its own."""
+    types = wanted_types(config or LogConfig())
+    recording = scan(path, lambda kind: Keep.ALL if short_name(kind) in types else Keep.NONE, window, progress)
+    own = recorded_config(recording) if config is None else None
+    if own is None or wanted_types(own) <= types:
+        return recording, config or own or LogConfig()
+    types = wanted_types(own)
+    return scan(path, lambda kind: Keep.ALL if short_name(kind) in types else Keep.NONE, window, progress), own
 
 
 class Assembly:
@@ -181,24 +195,24 @@ class Assembly:
         calibration: Calibration | PartialCalibration | None = None,
     ) -> None:
         self._recording = recording
-        self._topics = {role: recording.topics[c.topic] for role, c in choices.items() if c.topic is not None}
-        self._adapters: dict[str, Any] = {role: c.adapter for role, c in choices.items() if c.adapter is not None}
+        self.topics = {role: recording.topics[c.topic] for role, c in choices.items() if c.topic is not None}
+        self.adapters: dict[str, Any] = {role: c.adapter for role, c in choices.items() if c.adapter is not None}
         self._blocks: dict[str, Any] = {}
         self._dropped: dict[str, Dropped] = {}
         self._tables: dict[str, MessageTable] = {}
-        for role, topic in self._topics.items():
-            if self._adapters[role].reads_table:
+        for role, topic in self.topics.items():
+            if self.adapters[role].reads_table:
                 try:
-                    self._tables[role] = self._adapters[role].table(topic)
+                    self._tables[role] = self.adapters[role].table(topic)
                 except LogError:
                     if len(topic) or ROLES[role].is_required:
                         raise
                     self._dropped[role] = topic.unsound
         self._notes = {key: note for key, note in read_notes(recording).items() if key not in FOUND_ANEW}
-        self._notes["log.topics"] = "; ".join(f"{role}: {topic.name}" for role, topic in self._topics.items())
+        self._notes["log.topics"] = "; ".join(f"{role}: {topic.name}" for role, topic in self.topics.items())
         changes = {
-            role: changes_text(self._adapters[role], shipped_like(role, topic.type_name, topic.definition()))
-            for role, topic in self._topics.items()
+            role: changes_text(self.adapters[role], shipped_like(role, topic.type_name, topic.definition()))
+            for role, topic in self.topics.items()
         }
         if text := "; ".join(f"{role}: {change}" for role, change in changes.items() if change):
             self._notes["log.adapters"] = text
@@ -218,15 +232,15 @@ class Assembly:
         stated = mounted_by(recorded.model_dump(exclude_unset=True)) if recorded else set()
         stated |= mounted_by(given.values) if given else set()
         frames = {
-            role: self._adapters[role].frame_in(table.groups)
+            role: self.adapters[role].frame_in(table.groups)
             for role, table in self._tables.items()
             if role not in ("truth", "heading")
         }
         for role in ("depth", "positions"):
             if not frames.get(role, role):
                 del frames[role]  # in the world: there is no port or antenna to mount
-        if "detections" in self._topics and (messages := self._topics["detections"].messages()):
-            frames["sonar"] = self._adapters["detections"].frame_in(messages)
+        if "detections" in self.topics and (messages := self.topics["detections"].messages()):
+            frames["sonar"] = self.adapters["detections"].frame_in(messages)
         tree = static_frames(self._recording)
         mountings = {}
         for name, frame in frames.items():
@@ -253,35 +267,31 @@ class Assembly:
 
     def block(self, role: str) -> Any:
         """The measurements of a role; None where it has no topic, or none of its rows is fit."""
-        if role in self._blocks or role not in self._topics:
+        if role in self._blocks or role not in self.topics:
             return self._blocks.get(role)
-        topic, adapter = self._topics[role], self._adapters[role]
+        topic, adapter = self.topics[role], self.adapters[role]
         source: Any = self._tables.get(role) if adapter.reads_table else topic
         dropped: Dropped = {}
         if source is None:
             self._blocks[role] = None
-        elif isinstance(adapter, DepthAdapter):
-            gravity_m_s2 = self.calibration.gravity_m_s2
-            if assumption := adapter.assumption(gravity_m_s2):
-                self._notes["log.depth"] = assumption
-            self._blocks[role], dropped = adapter.read(source, gravity_m_s2)
-        elif isinstance(adapter, HeadingAdapter):
-            self._blocks[role], dropped = adapter.read(source, self._heading_mounting().pose().rotation().matrix())
-        elif isinstance(adapter, PositionAdapter):
-            self._blocks[role], dropped = adapter.read(source, self._origin(), self.calibration.positions.sigma_m)
-        elif isinstance(adapter, TruthAdapter):
-            self._blocks[role], dropped = adapter.read(source, self._origin())
         else:
-            self._blocks[role], dropped = adapter.read(source)
+            if isinstance(adapter, DepthAdapter) and (said := adapter.assumption(self.calibration.gravity_m_s2)):
+                self._notes["log.depth"] = said
+            self._blocks[role], dropped = rows_of(adapter, source, self.calibration, *self.axes_and_origin(role))
         if dropped := topic.unsound | dropped:
             self._dropped[role] = dropped
         return self._blocks[role]
 
+    def axes_and_origin(self, role: str) -> tuple[Floats, Origin | None]:
+        """``body_R_sensor`` of an orientation, and the origin of positions on the Earth, for `rows_of`."""
+        R = self._heading_mounting().pose().rotation().matrix() if role == "heading" else np.eye(3)
+        return R, self._origin() if role in ("positions", "truth") else None
+
     def _heading_mounting(self) -> Mounting:
         """Mounting of the sensor of an orientation: the IMU's where it is its topic, else that of its frame."""
-        if self._topics["heading"] is self._topics.get("imu"):
+        if self.topics["heading"] is self.topics.get("imu"):
             return self.calibration.imu.mounting
-        frame = self._adapters["heading"].frame_in(self._tables["heading"].groups)
+        frame = self.adapters["heading"].frame_in(self._tables["heading"].groups)
         return mounting_of(frame, static_frames(self._recording)) or Mounting()
 
     def _origin(self) -> Origin | None:
@@ -292,7 +302,7 @@ class Assembly:
         of_earth = {
             role: adapter.geodetic
             for role in ("positions", "truth")
-            if role in self._tables and (adapter := self._adapters[role]).geodetic is not None
+            if role in self._tables and (adapter := self.adapters[role]).geodetic is not None
         }
         said = [fields.origin_deg_m for fields in of_earth.values() if fields.origin_deg_m is not None]
         found = [fix for role, fields in of_earth.items() if (fix := fields.first_fix(self._tables[role])) is not None]
@@ -312,7 +322,7 @@ class Assembly:
         """
         for role in ("imu", "dvl"):
             if self.block(role) is None:
-                topic, faults = self._topics[role], _counts(self._dropped.get(role, {}))
+                topic, faults = self.topics[role], _counts(self._dropped.get(role, {}))
                 raise topic.error(f"none of its {len(topic)} messages can be used: {faults}")
         require_use(str(self._recording.path), self.block("imu"), self.block("dvl"))
         blocks = {role: self.block(role) for role in SEQUENCE_ROLES}
@@ -351,7 +361,7 @@ class Assembly:
     def warnings(self) -> Iterator[str]:
         """Sentences about messages that can be read but look wrong, each after its role."""
         for role, table in self._tables.items():
-            yield from (f"{role}: {text}" for text in self._adapters[role].warnings(table))
+            yield from (f"{role}: {text}" for text in self.adapters[role].warnings(table))
         imu, dvl, depth, detections = (self.block(role) for role in ("imu", "dvl", "depth", "detections"))
         mounting, gravity_m_s2 = self.calibration.imu.mounting, self.calibration.gravity_m_s2
         is_linear = self.calibration.odometry_interpolation == "linear"  # otherwise rates jump, and wheels turn evenly
@@ -372,7 +382,7 @@ class Assembly:
             start_ns = max(imu.stamps_ns[0], dvl.stamps_ns[0])
             found.append(("depth", start_depth_warning(depth, int(start_ns), self.calibration)))
         if "dvl" in self._tables and not self._is_mounting_known:
-            found.append(("dvl", axes_warning(self._adapters["dvl"])))
+            found.append(("dvl", axes_warning(self.adapters["dvl"])))
         yield from (f"{role}: {text}" for role, text in found if text)
         yield from unsaid_noise({role: self.block(role) for role in NOISE_FIELDS}, only_partly=True)
         stamps = [self._tables[role].stamps_ns for role in ("imu", "dvl") if role in self._tables]
@@ -380,6 +390,25 @@ class Assembly:
             first_ns, last_ns = max(ns.min() for ns in stamps), min(ns.max() for ns in stamps)
             texts = detection_warnings(detections, int(first_ns), int(last_ns))
             yield from (f"detections: {text}" for text in texts)
+
+
+def rows_of(
+    adapter: Any, source: Any, calibration: Calibration, body_R_sensor: Floats, origin: Origin | None
+) -> tuple[Any, Dropped]:
+    """Rows of a table of messages, or of a topic where the adapter reads that, and the numbers left out by reason.
+
+    ``body_R_sensor`` is of the sensor of an orientation; ``origin`` of the world, in degrees and metres.
+    """
+    if isinstance(adapter, DepthAdapter):
+        return adapter.read(source, calibration.gravity_m_s2)
+    if isinstance(adapter, HeadingAdapter):
+        return adapter.read(source, body_R_sensor)
+    if isinstance(adapter, PositionAdapter):
+        return adapter.read(source, origin, calibration.positions.sigma_m)
+    if isinstance(adapter, TruthAdapter):
+        return adapter.read(source, origin)
+    found: tuple[Any, Dropped] = adapter.read(source)
+    return found
 
 
 def _counts(dropped: Dropped) -> str:

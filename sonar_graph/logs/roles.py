@@ -21,6 +21,7 @@ LANDMARK_MAP = "sonar_graph_msgs/msg/LandmarkMap"
 SONAR_IMAGE = "marine_acoustic_msgs/msg/ProjectedSonarImage"
 HEADING = "sonar_graph_msgs/msg/Heading"
 POINT = "geometry_msgs/msg/PointStamped"
+DROPPED = "sonar_graph_msgs/msg/Dropped"
 TF = "tf2_msgs/msg/TFMessage"
 SONAR = "sonar"
 """The role of sonar images."""
@@ -91,7 +92,7 @@ class Choice:
 def wanted_types(config: LogConfig = _DEFAULTS, roles: Iterable[str] = SEQUENCE_ROLES) -> frozenset[str]:
     """Types whose messages may be needed, without the ``msg``."""
     shipped = {short_name(offer.adapter.type) for name in roles for offer in ROLES[name].shipped}
-    return config.types() | shipped | {short_name(TF)}
+    return config.types() | shipped | {short_name(TF), short_name(DROPPED)}
 
 
 def refusal(topic: Topic) -> str | None:

@@ -44,6 +44,8 @@ class ImuAdapter(Adapter):
     """Turns them into m/s²; 9.80665 from g, -1 where the driver gives gravity's own direction."""
     linear_acceleration_status: str | None = None
     """Field that is -1 where it was not measured."""
+    are_zeros_measured: bool = False
+    """true: an acceleration of 0 is a value even where all messages have it; else the driver does not fill it."""
 
     def fields(self) -> Iterator[str]:
         """Paths that a message must have."""
@@ -71,6 +73,8 @@ class ImuAdapter(Adapter):
 
     def _is_force_unfilled(self, table: MessageTable) -> bool:
         """Tell whether the force is zero in all messages, which not even free fall gives."""
+        if self.are_zeros_measured:
+            return False
         measured = table.beside(self.linear_acceleration)[~_is_marked(table, self.linear_acceleration_status)]
         return bool(len(measured)) and not measured.any()
 

@@ -1,11 +1,11 @@
 """CDR payloads of ROS 2 messages as columns, by the message definition in the log."""
 
 # fmt: off
-from sonar_graph.logs.cdr.definitions import Struct, definition, parse_definition, short_name
+from sonar_graph.logs.cdr.definitions import DEFINITIONS, Struct, definition, parse_definition, short_name
 from sonar_graph.logs.cdr.layout import Bytes
 from sonar_graph.logs.cdr.messages import Decoded, Decoder, Messages, Value, decode, encode
 
 __all__ = [
-    "Bytes", "Decoded", "Decoder", "Messages", "Struct", "Value", "decode", "definition", "encode",
+    "Bytes", "DEFINITIONS", "Decoded", "Decoder", "Messages", "Struct", "Value", "decode", "definition", "encode",
     "parse_definition", "short_name",
 ]

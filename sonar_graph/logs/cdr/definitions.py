@@ -42,6 +42,18 @@ string child_frame_id
 geometry_msgs/PoseWithCovariance pose
 geometry_msgs/TwistWithCovariance twist""",
     "nav_msgs/Path": "std_msgs/Header header\ngeometry_msgs/PoseStamped[] poses",
+    "diagnostic_msgs/KeyValue": "string key\nstring value",
+    "diagnostic_msgs/DiagnosticStatus": """\
+byte OK=0
+byte WARN=1
+byte ERROR=2
+byte STALE=3
+byte level
+string name
+string message
+string hardware_id
+diagnostic_msgs/KeyValue[] values""",
+    "diagnostic_msgs/DiagnosticArray": "std_msgs/Header header\ndiagnostic_msgs/DiagnosticStatus[] status",
     "sensor_msgs/Imu": """\
 std_msgs/Header header
 geometry_msgs/Quaternion orientation
@@ -147,6 +159,11 @@ int64[] track                  # the watch of one object that each belongs to, -
 std_msgs/Header header
 float64 yaw_rad                # Rz(yaw) Ry(pitch) Rx(roll), positive to the left
 float64 sigma_rad              # standard deviation; NaN: unknown""",
+    "sonar_graph_msgs/Dropped": """\
+# A message of a record that the estimator was not given when it was live.
+string topic
+uint64 log_time                # time of its arrival, nanoseconds, which names it in its topic
+string reason""",
     "sonar_graph_msgs/LandmarkMap": """\
 # Landmarks by identity, in the frame of the header.
 std_msgs/Header header

@@ -131,6 +131,14 @@ class Topic:
             windows = np.ndarray((len(data) - size + 1,), f"V{size}", data, strides=(1,))
             self.stacks[size].append((first + rows, windows[offsets[rows]].view(np.uint8).reshape(-1, size)))
 
+    def leave_out(self, log_times_ns: Ints) -> None:
+        """Remove the messages that were recorded at some times."""
+        is_kept = ~np.isin(self.log_times_ns, log_times_ns)
+        number = np.cumsum(is_kept) - 1
+        for size, parts in self.stacks.items():
+            self.stacks[size] = [(number[rows[is_kept[rows]]], payloads[is_kept[rows]]) for rows, payloads in parts]
+        self.times, self._count = [self.log_times_ns[is_kept]], int(np.count_nonzero(is_kept))
+
     def empty(self) -> Topic:
         """The same topic without messages."""
         return replace(self, times=[], stacks=defaultdict(list), unsound={}, held_bytes=0, _count=0)

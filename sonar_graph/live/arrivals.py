@@ -1,0 +1,154 @@
+"""Steps of an estimator from messages in the order in which they arrive, without a clock.
+
+Sensors are late by different times, so that a message may arrive after messages of other sensors that are stamped after
+it. Estimates are wanted at the instants of `Sequence.instants`,
+
+    t_k = t_0 + k T,    t_0 = max(first IMU stamp, first Doppler stamp)
+
+The step up to t_k is complete when every sensor in use has a message stamped at or after t_k, or any sensor one stamped
+at or after t_k + L, with the lateness budget L. A message stamped at or before the last complete instant is
+late. It is refused by name, so that a log without the refused messages gives the same steps, to the bit.
+
+Time of arrival has one use: a stamp that runs ahead of its time of arrival is of a clock that was set, and would make
+all other sensors late.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from sonar_graph.errors import MeasurementError
+from sonar_graph.measurements import BLOCKS, NS_PER_S, PAUSE_NS, Block, Measurements
+
+LATE = "late: its step was complete"
+REPEATED = "with the stamp of another"
+AHEAD = "stamped ahead of its arrival: a clock was set?"
+MOTION = ("imu", "dvl")
+"""Sensors without which there is no estimate."""
+AHEAD_NS = NS_PER_S
+"""Time by which a stamp may run ahead of its arrival, compared with the newest message before."""
+NEW_CLOCK_NS = 2 * NS_PER_S
+"""Time of arrival after which stamps ahead are believed, where no other was."""
+MOST_PARTS = 256
+"""Number of waiting blocks of a sensor that are made one."""
+
+
+class Arrivals:
+    """Messages that wait for those that may still come.
+
+    Parameters
+    ----------
+    rate_hz
+        Number of estimates a second.
+    lateness_s
+        Lateness budget L: how long a step waits, by stamps, for a sensor that is silent or slow.
+
+    Examples
+    --------
+    A Doppler row that comes after an IMU row with a later stamp is not late, since its step is not complete:
+
+    >>> import numpy as np
+    >>> from sonar_graph import Dvl, Imu
+    >>> def imu(at_ms):
+    ...     return Imu(np.array([at_ms * 1_000_000]), np.zeros((1, 3)), np.array([[0.0, 0.0, 9.81]]))
+    >>> def dvl(at_ms):
+    ...     return Dvl(np.array([at_ms * 1_000_000]), np.zeros((1, 3)), np.full((1, 3, 3), np.nan))
+    >>> arrivals = Arrivals(rate_hz=10.0)
+    >>> for role, block in [("imu", imu(0)), ("dvl", dvl(0)), ("imu", imu(110)), ("dvl", dvl(100))]:
+    ...     arrivals.add(role, int(block.stamps_ns[0]), block)
+    >>> [(step.end_ns, len(step.imu), len(step.dvl)) for step in arrivals.steps()]
+    [(100000000, 1, 2)]
+    >>> arrivals.add("dvl", 100_000_000, dvl(100))
+    'late: its step was complete'
+    """
+
+    def __init__(self, rate_hz: float, lateness_s: float = 0.25) -> None:
+        if not 0 < rate_hz <= NS_PER_S:
+            raise MeasurementError(f"{rate_hz} Hz is no rate; expected more than 0")
+        if not 0 <= lateness_s < float("inf"):
+            raise MeasurementError(f"a lateness budget of {lateness_s} s is none; expected 0 or more")
+        self.step_ns = round(NS_PER_S / rate_hz)
+        self.lateness_ns = round(lateness_s * NS_PER_S)
+        self.newest_ns: dict[str, int] = {}
+        """Newest stamp of each sensor."""
+        self.done_ns: int | None = None
+        """Last complete instant."""
+        self._first_ns: dict[str, int] = {}
+        self._waiting: dict[str, list[Block]] = {name: [] for name in BLOCKS}
+        self._stamps_ns: dict[str, set[int]] = {name: set() for name in BLOCKS}
+        self._last_arrival_ns: int | None = None
+
+    def add(self, sensor: str, stamp_ns: int, block: Block | None, arrival_ns: int | None = None) -> str | None:
+        """Take in a message of a sensor, by its name in `Measurements`; the reason why it is refused, or None.
+
+        ``block``: its rows, all of this stamp; None of a sonar frame in which nothing was detected, which says that
+        no detection up to its stamp will come.
+        """
+        if arrival_ns is not None and self._last_arrival_ns is not None:
+            since_ns = max(arrival_ns - self._last_arrival_ns, 0)
+            if stamp_ns - max(self.newest_ns.values()) > since_ns + AHEAD_NS and since_ns < NEW_CLOCK_NS:
+                return AHEAD
+        if self.done_ns is not None and stamp_ns <= self.done_ns:
+            return LATE
+        if block is not None:
+            if sensor != "detections" and stamp_ns in self._stamps_ns[sensor]:
+                return REPEATED
+            self._stamps_ns[sensor].add(stamp_ns)
+            self._waiting[sensor].append(block)
+            if len(self._waiting[sensor]) > MOST_PARTS:
+                self._waiting[sensor] = [_joined(self._waiting[sensor])]
+            self._first_ns[sensor] = min(stamp_ns, self._first_ns.get(sensor, stamp_ns))
+        self.newest_ns[sensor] = max(stamp_ns, self.newest_ns.get(sensor, stamp_ns))
+        self._last_arrival_ns = arrival_ns
+        return None
+
+    @property
+    def start_ns(self) -> int | None:
+        """Instant at which the start pose holds, once both sensors of the motion have sent."""
+        has_both = all(name in self._first_ns for name in MOTION)
+        return max(self._first_ns[name] for name in MOTION) if has_both else None
+
+    def steps(self) -> Iterator[Measurements]:
+        """Steps that are complete by now, in order."""
+        if self.start_ns is None:
+            return
+        end_ns = (self.start_ns if self.done_ns is None else self.done_ns) + self.step_ns
+        while min(self.newest_ns.values()) >= end_ns or max(self.newest_ns.values()) >= end_ns + self.lateness_ns:
+            yield self._step(end_ns)
+            end_ns += self.step_ns
+
+    def rest(self) -> Iterator[Measurements]:
+        """Steps that are left when nothing more will come: up to the last instant with IMU and Doppler log."""
+        if self.start_ns is None:
+            return
+        end_ns = (self.start_ns if self.done_ns is None else self.done_ns) + self.step_ns
+        while min(self.newest_ns[name] for name in MOTION) >= end_ns:
+            yield self._step(end_ns)
+            end_ns += self.step_ns
+
+    def _step(self, end_ns: int) -> Measurements:
+        assert self.start_ns is not None
+        after_ns = self.start_ns - PAUSE_NS if self.done_ns is None else self.done_ns
+        rows: dict[str, Any] = {}
+        for name, parts in self._waiting.items():
+            if parts:
+                block = _joined(parts)
+                rows[name] = block.between(after_ns, end_ns)
+                left = block.between(end_ns, int(block.stamps_ns[-1]))
+                self._waiting[name] = [] if left is None else [left]
+                self._stamps_ns[name] = set() if left is None else set(left.stamps_ns.tolist())
+        self.done_ns = end_ns
+        return Measurements(end_ns, **rows)
+
+
+def _joined(parts: list[Any]) -> Any:
+    """One block in the order of stamps; of equal ones in that of arrival."""
+    if len(parts) == 1:
+        return parts[0]
+    stamps_ns = np.concatenate([part.stamps_ns for part in parts])
+    order = np.argsort(stamps_ns, kind="stable")
+    columns = {name: np.concatenate([getattr(part, name) for part in parts])[order] for name in vars(parts[0])}
+    return type(parts[0])(**columns)

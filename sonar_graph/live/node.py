@@ -1,0 +1,336 @@
+"""A live run: messages of a robot in; poses, landmarks and state out; a record and the outcome in a folder.
+
+    transport -> inbox -> Engine -> record
+                            |-> rows  -> Predictor -> odometry and frames, at the rate of the IMU
+                            |-> steps -> Worker (a process) -> estimates -> Predictor, pose, landmarks
+
+One thread takes messages from the inbox, so that everything happens in the order of arrival; the transport's own thread
+only appends to it.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Self
+
+import gtsam
+import numpy as np
+
+from sonar_graph.errors import EstimatorError, LogError
+from sonar_graph.live.engine import Engine
+from sonar_graph.live.live_messages import Message
+from sonar_graph.live.outlets import OWN, Outlet, PoseForms, payload_of_pose, payload_of_state, payloads_of_map
+from sonar_graph.live.predictor import Predictor
+from sonar_graph.live.worker import Answer, LiveOutcome, Worker
+from sonar_graph.logs import ROLES, LiveRecord, PartialCalibration, wanted_types
+from sonar_graph.logs.adapters import LogConfig
+from sonar_graph.logs.cdr import short_name
+from sonar_graph.sequence import Sequence
+from sonar_graph.simulation import MissionOptions, simulate_mission
+from sonar_graph.states import Estimate
+
+FLUSH_S = 0.25
+STATE_S = 1.0
+MOST_WAITING_S = 2.0
+"""Time of steps that may wait for the estimator before the oldest lose their detections."""
+
+
+WARM_UP_S = 20.0
+
+
+class Inbox:
+    """Messages that wait to be taken, bounded: the oldest are dropped and counted."""
+
+    def __init__(self, most_bytes: int = 1 << 28) -> None:
+        self.dropped: Counter[str] = Counter()
+        self._messages: deque[Message] = deque()
+        self._bytes, self._most_bytes = 0, most_bytes
+        self._changed = threading.Condition()
+
+    def put(self, message: Message) -> None:
+        """Append a message."""
+        with self._changed:
+            self._messages.append(message)
+            self._bytes += len(message.payload)
+            while self._bytes > self._most_bytes:
+                oldest = self._messages.popleft()
+                self._bytes -= len(oldest.payload)
+                self.dropped[oldest.topic] += 1
+            self._changed.notify()
+
+    def take(self, timeout_s: float) -> list[Message]:
+        """All messages that wait; an empty list if none comes in time."""
+        with self._changed:
+            if not self._messages:
+                self._changed.wait(timeout_s)
+            messages = list(self._messages)
+            self._messages.clear()
+            self._bytes = 0
+            return messages
+
+
+@dataclass
+class LiveOptions:
+    """Choices of a live run."""
+
+    estimator: str = "isam2"
+    overrides: Mapping[str, Any] = field(default_factory=dict)
+    rate_hz: float = 10.0
+    lateness_s: float = 0.25
+    topics: Mapping[str, str] = field(default_factory=dict)
+    config: LogConfig | None = None
+    calibration: PartialCalibration | None = None
+
+
+class LiveRun:
+    """A live run from its first message to its outcome.
+
+    Parameters
+    ----------
+    record
+        Record, to which every message goes.
+    definition_of
+        Function that gives the definition of a message type.
+    outlets
+        Where messages are sent.
+    said
+        Called with lines for the user.
+    """
+
+    def __init__(
+        self,
+        record: LiveRecord,
+        definition_of: Callable[[str], str],
+        options: LiveOptions,
+        outlets: list[Outlet],
+        said: Callable[[str], None],
+    ) -> None:
+        self.inbox = Inbox()
+        self.engine = Engine(
+            record,
+            definition_of,
+            rate_hz=options.rate_hz,
+            lateness_s=options.lateness_s,
+            wanted=options.topics,
+            config=options.config,
+            calibration=options.calibration,
+        )
+        self.predict_s: list[float] = []
+        """Durations of the newest predictions."""
+        self._record, self._options, self._outlets, self._said = record, options, outlets, said
+        self._types = wanted_types(options.config or LogConfig(), ROLES)
+        self._unused: set[str] = set()
+        self._forms = PoseForms()
+        self._answers: deque[Answer] = deque()
+        warm_up = simulate_mission(MissionOptions(duration_s=WARM_UP_S))
+        self._worker = Worker(
+            options.estimator,
+            dict(options.overrides),
+            warm_up,
+            options.rate_hz,
+            self._answers.append,
+            max(1, round(MOST_WAITING_S * options.rate_hz)),
+            lambda step: self.engine.without_detections(step, time.time_ns()),
+        )
+        warm_predictor(warm_up)
+        self._predictor: Predictor | None = None
+        self._is_failed = False
+        self._is_quiet = False  # while what an earlier run had is taken in: nobody waits for those poses
+        self._generation = -1
+        self._flushed_s = self._stated_s = time.monotonic()
+        self._withheld: list[str] = []
+        self._latency_ns = self._estimates = self._newest_ns = 0
+        self._longest_update_s = 0.0
+
+    def accept(self, message: Message) -> None:
+        """Put a message into the inbox, if it is of use; called by the transport's thread."""
+        if message.topic.startswith(OWN) or short_name(message.type_name) not in self._types:
+            return
+        self.inbox.put(message)
+
+    def catch_up(self, messages: Iterator[Message], dropped: Mapping[tuple[str, int], str]) -> int:
+        """Take the messages of an earlier record, with what was dropped then; the time of arrival of the last."""
+        last_ns, self._is_quiet = 0, True
+        for message in messages:
+            last_ns = max(last_ns, message.arrival_ns)
+            self._take(message, dropped.get((message.topic, message.arrival_ns)))
+            while (self._worker.waiting or self._worker.is_busy) and self._worker.error is None:
+                time.sleep(1e-4)
+            while self._answers:
+                self._use(self._answers.popleft())
+        self._record.flush()
+        self._is_quiet = False
+        return last_ns
+
+    def counts(self) -> dict[str, dict[str, int]]:
+        """Numbers of messages received, lost and dropped, by topic, and by topic and reason."""
+        counts = self.engine.counts
+        dropped = {f"{name}: {why}": number for (name, why), number in sorted(counts.dropped.items())}
+        lost = +(counts.lost + self.inbox.dropped)
+        return {
+            "received": dict(sorted(counts.received.items())),
+            "lost": dict(sorted(lost.items())),
+            "dropped": dropped,
+        }
+
+    def lacking(self) -> str:
+        """What was missing for an estimate."""
+        if not self.engine.topics:
+            return "no message came; is the domain right, and is a router running?"
+        came = ", ".join(f"{name} ({topic.type_name})" for name, topic in self.engine.topics.items())
+        return f"an estimate needs an IMU and a Doppler log; there came {came}"
+
+    def turn(self, timeout_s: float = 0.05) -> None:
+        """Take what has come, and send what follows from it."""
+        for message in self.inbox.take(timeout_s):
+            self._take(message)
+        while self._answers:
+            self._use(self._answers.popleft())
+        now_s = time.monotonic()
+        if now_s > self._flushed_s + FLUSH_S:
+            self._record.flush()
+            self._flushed_s = now_s
+        if now_s > self._stated_s + STATE_S and self._predictor is not None:
+            self._state()
+            self._stated_s = now_s
+        if self._worker.error is not None and not self._is_failed:
+            self._is_failed = True
+            self._said(f"{self._failure()}; everything is still recorded")
+
+    def finish(self) -> LiveOutcome | None:
+        """LiveOutcome when no more messages will come; None where nothing could be estimated."""
+        for message in self.inbox.take(0.0):
+            self._take(message)
+        for step in self.engine.finish():
+            self._worker.add(step)
+        if self._predictor is None:
+            return None
+        try:
+            return self._worker.finish()
+        except Exception as error:  # an estimator may fail in any way
+            raise EstimatorError(self._failure()) from error
+
+    def _failure(self) -> str:
+        return f"{self._options.estimator} failed: {self._worker.error}"
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._worker.end()
+
+    def _take(self, message: Message, dropped: str | None = None) -> None:
+        if message.topic in self._unused:
+            return
+        try:
+            parts = self.engine.take(message, dropped)
+        except LogError as error:
+            if self.engine.calibration is None and message.topic in self.engine.topics:
+                raise
+            self._unused.add(message.topic)
+            self._said(f"not used: {error}")
+            return
+        if self.engine.calibration is not None and self._generation != self.engine.generation:
+            self._begin()
+        for part in parts:
+            if self._predictor is None or part.role not in ("imu", "dvl") or part.block is None:
+                continue
+            is_imu = part.role == "imu"
+            self._predictor.add(part.block if is_imu else None, None if is_imu else part.block)
+            if is_imu and part is parts[-1] and not self._is_quiet:
+                self._predict(message.arrival_ns)
+        for step in self.engine.steps():
+            self._worker.add(step)
+
+    def _begin(self) -> None:
+        assert self.engine.calibration is not None
+        options, calibration = self._options, self.engine.calibration
+        self._generation = self.engine.generation
+        for subject in ("log.topics", "log.calibration", "log.start"):
+            if subject in self.engine.notes:
+                self._said(f"{subject.removeprefix('log.')}: {self.engine.notes[subject]}")
+        for warning in self.engine.notes.get("log.warnings", "").split("; "):
+            if warning and not warning.startswith("detections:"):  # the odometry after the newest has not come yet
+                self._said(f"warning: {warning}")
+        self._worker.begin(calibration)
+        self._predictor = Predictor(calibration)
+        self._newest_ns = 0
+        self._said(f"estimating by {options.estimator}; Ctrl-C ends")
+
+    def _predict(self, arrival_ns: int) -> None:
+        assert self._predictor is not None
+        before_s = time.perf_counter()
+        at = self._predictor.predict()
+        if at is None or at.stamp_ns <= self._newest_ns:
+            return
+        self.predict_s.append(time.perf_counter() - before_s)
+        self._newest_ns = at.stamp_ns
+        self._put("/sonar_graph/odometry", self._forms.odometry(at))
+        self._put("/tf", self._forms.body(at))
+        self._latency_ns = max(self._latency_ns, time.time_ns() - arrival_ns)
+
+    def _use(self, answer: Answer) -> None:
+        assert self._predictor is not None
+        self._withheld = answer.withheld
+        self._longest_update_s = max(self._longest_update_s, answer.update_s)
+        self._estimates += len(answer.estimates)
+        for estimate in answer.estimates:
+            self._put("/sonar_graph/pose", payload_of_pose(estimate))
+        if answer.estimates:
+            newest = answer.estimates[-1]
+            self._predictor.correct(newest)
+            self._put("/tf", self._forms.correction(newest.stamp_ns, self._predictor.map_T_odom))
+            if answer.landmarks is not None and len(answer.landmarks):
+                landmarks, markers = payloads_of_map(answer.landmarks, newest.stamp_ns)
+                self._put("/sonar_graph/landmarks", landmarks)
+                self._put("/sonar_graph/markers", markers)
+
+    def _state(self) -> None:
+        counts = self.engine.counts
+        lost = +(counts.lost + self.inbox.dropped)
+        values = {
+            "latency_ms": f"{self._latency_ns * 1e-6:.1f}",
+            "longest_update_ms": f"{self._longest_update_s * 1e3:.1f}",
+            "predictor_p99_us": f"{1e6 * np.percentile(self.predict_s or [np.nan], 99):.0f}",
+            "steps_waiting": str(self._worker.waiting),
+            "estimates": str(self._estimates),
+            "lost": ", ".join(f"{name} {n}" for name, n in sorted(lost.items())) or "none",
+            "dropped": ", ".join(f"{name} {n} {why}" for (name, why), n in sorted(counts.dropped.items())) or "none",
+            "withheld": "; ".join(self._withheld) or "none",
+        }
+        is_well = not (lost or counts.dropped or self._withheld)
+        summary = "running" if is_well else "messages are lost, dropped or withheld"
+        self._put("/sonar_graph/state", payload_of_state(self._newest_ns, is_well, summary, values))
+        self._latency_ns, self._longest_update_s = 0, 0.0
+        del self.predict_s[: -20 * 1000]
+
+    def _put(self, topic: str, payload: bytes) -> None:
+        for outlet in self._outlets:
+            outlet.put(topic, payload)
+
+
+def warm_predictor(world: Sequence) -> None:
+    """Compile what a predictor needs."""
+    predictor = Predictor(world.calibration)
+    for step in world.replay(world.instants(1.0)):
+        predictor.add(step.imu, step.dvl)
+        predictor.correct(Estimate(step.end_ns, gtsam.Pose3(), np.eye(6)))
+        predictor.predict()
+
+
+def write_outcome(folder: Path, name: str, outcome: LiveOutcome, counts: Mapping[str, Any]) -> None:
+    """Trajectories and landmarks of a live run, named as `sonar-graph run` names them, and ``live.json``."""
+    from sonar_graph.files import write_json
+    from sonar_graph.logs import write_landmarks_csv, write_tum
+
+    write_json(folder / "live.json", {"estimator": name, "messages": counts})
+    place = folder / "runs" / name
+    place.mkdir(parents=True, exist_ok=True)
+    write_tum(place / "causal.tum", outcome.causal)
+    write_tum(place / "trajectory.tum", outcome.smoothed)
+    write_landmarks_csv(place / "landmarks.csv", outcome.landmarks)

@@ -1,0 +1,215 @@
+"""Estimator in a process of its own, so that its updates delay no prediction.
+
+Steps wait in order, and all that wait are sent at once. Where they are more than a bound, those that wait longest lose
+their detections (never IMU or Doppler rows, without which the pose would be wrong): the record names them.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from sonar_graph.calibration import Calibration
+from sonar_graph.estimator import Estimator, load_estimator, make_params, refused_rows_of, withheld_of
+from sonar_graph.files import READY, OwnProcess, Tell, serve
+from sonar_graph.measurements import Measurements
+from sonar_graph.sequence import Sequence
+from sonar_graph.states import Estimate, LandmarkMap, RefusedRow, Trajectory
+
+MAP_SHARE = 20.0
+"""Time between two maps over the time that one takes to solve."""
+LEAST_MAP_S = 1.0
+MOST_AT_ONCE = 100
+"""Number of steps in one request, so that estimates come while many wait."""
+
+
+@dataclass(frozen=True)
+class Begin:
+    """Request to make an estimator anew."""
+
+    name: str
+    overrides: dict[str, Any]
+    calibration: Calibration
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Estimates of some steps."""
+
+    estimates: list[Estimate]
+    landmarks: LandmarkMap | None
+    """The map, now and then."""
+    withheld: list[str]
+    update_s: float
+    """Duration of the longest update."""
+
+
+@dataclass(frozen=True)
+class LiveOutcome:
+    """What an estimator knows at the end."""
+
+    causal: Trajectory
+    smoothed: Trajectory
+    landmarks: LandmarkMap
+    refused: list[RefusedRow]
+
+
+FINISH = "finish"
+
+
+class _Served:
+    """State of the process that serves."""
+
+    estimator: Estimator
+    estimates: list[Estimate]
+    next_map_s = 0.0
+
+
+def serve_estimator() -> None:
+    """Answer requests until stdin ends."""
+    serve(_answer)
+
+
+def _answer(request: Any, tell: Tell) -> object:  # noqa: ARG001  # of `serve`
+    if isinstance(request, Begin):
+        from sonar_graph.navigation import Odometry  # loads numba
+
+        kind = load_estimator(request.name)
+        params = make_params(kind, request.overrides, request.name)
+        _Served.estimator = kind(request.calibration, Odometry(request.calibration), params)
+        _Served.estimates, _Served.next_map_s = [], 0.0
+        return READY
+    estimator = _Served.estimator
+    if request == FINISH:
+        smoothed, landmarks = estimator.trajectory(), estimator.landmarks()
+        return LiveOutcome(
+            Trajectory.from_estimates(_Served.estimates), smoothed, landmarks, refused_rows_of(estimator)
+        )
+    found, longest_s, landmarks_now = [], 0.0, None
+    for step in request:
+        before_s = time.perf_counter()
+        estimate = estimator.process(step)
+        longest_s = max(longest_s, time.perf_counter() - before_s)
+        if estimate is not None:
+            found.append(estimate)
+    _Served.estimates += found
+    before_s = time.perf_counter()
+    if found and before_s >= _Served.next_map_s:
+        landmarks_now = estimator.landmarks()
+        after_s = time.perf_counter()
+        _Served.next_map_s = after_s + max(LEAST_MAP_S, MAP_SHARE * (after_s - before_s))
+    return Answer(found, landmarks_now, withheld_of(estimator), longest_s)
+
+
+class Worker:
+    """Estimator in its process, and the steps that wait for it.
+
+    Parameters
+    ----------
+    name, overrides
+        Estimator and its settings.
+    warm_up
+        Simulated run on which what is slow the first time is compiled, before anything is received.
+    answered
+        Called with each `Answer`, by a thread of the worker.
+    most_waiting
+        Number of waiting steps beyond which the oldest lose their detections.
+    without_detections
+        Gives a step without them.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        overrides: dict[str, Any],
+        warm_up: Sequence,
+        rate_hz: float,
+        answered: Callable[[Answer], None],
+        most_waiting: int,
+        without_detections: Callable[[Measurements], Measurements],
+    ) -> None:
+        self._process = OwnProcess(("-c", "from sonar_graph.live.worker import serve_estimator; serve_estimator()"))
+        self._name, self._overrides = name, overrides
+        self._answered, self._without_detections = answered, without_detections
+        self._most_waiting = most_waiting
+        self._waiting: list[Measurements] = []
+        self._begins: Begin | None = None
+        self._is_catching_up = False
+        self._changed = threading.Condition()
+        self._is_done = self.is_busy = False
+        self.error: Exception | None = None
+        """Why the estimator failed, if it did."""
+        self._process.answer()  # that it is ready
+        steps = list(warm_up.replay(warm_up.instants(rate_hz)))
+        for request in (Begin(name, overrides, warm_up.calibration), steps, FINISH):
+            self._ask(request)
+        self._thread = threading.Thread(target=self._work, daemon=True)
+
+    def begin(self, calibration: Calibration) -> None:
+        """Begin the run, also anew: steps that wait are forgotten, and those that follow may be many for a while."""
+        with self._changed:
+            self._begins, self._is_catching_up = Begin(self._name, self._overrides, calibration), True
+            self._waiting.clear()
+            self._changed.notify()
+        if not self._thread.ident:
+            self._thread.start()
+
+    def _ask(self, request: object) -> Any:
+        self._process.send(request)
+        return self._process.answer()
+
+    @property
+    def waiting(self) -> int:
+        """Number of steps that wait."""
+        return len(self._waiting)
+
+    def add(self, step: Measurements) -> None:
+        """Queue a step; too many that wait lose their detections, the oldest first."""
+        if self.error is not None:
+            return
+        with self._changed:
+            self._waiting.append(step)
+            late = len(self._waiting) - self._most_waiting
+            if late > 0 and not self._is_catching_up and self._waiting[late - 1].detections is not None:
+                self._waiting[late - 1] = self._without_detections(self._waiting[late - 1])
+            self._changed.notify()
+
+    def finish(self) -> LiveOutcome:
+        """LiveOutcome after all steps that wait; raises what the estimator raised."""
+        with self._changed:
+            self._is_done = True
+            self._changed.notify()
+        self._thread.join()
+        if self.error is not None:
+            raise self.error
+        outcome: LiveOutcome = self._ask(FINISH)
+        return outcome
+
+    def end(self) -> None:
+        """End the process."""
+        self._process.end()
+
+    def _work(self) -> None:
+        try:
+            while True:
+                with self._changed:
+                    self.is_busy = False
+                    while not (self._waiting or self._begins or self._is_done):
+                        self._changed.wait()
+                    begin, self._begins = self._begins, None
+                    steps, self._waiting = self._waiting[:MOST_AT_ONCE], self._waiting[MOST_AT_ONCE:]
+                    self.is_busy = True
+                if begin is not None:
+                    self._ask(begin)
+                if steps:
+                    answer = self._ask(steps)
+                    self._is_catching_up &= bool(self._waiting)
+                    if self._begins is None:  # else it is of a run that is over
+                        self._answered(answer)
+                elif begin is None:
+                    return
+        except Exception as error:  # an estimator may fail in any way
+            self.error = error

@@ -1,0 +1,153 @@
+"""Record of a live run: every message as it came, and what the estimator was not given.
+
+A record is a log like any other. Its metadata record ``sonar_graph`` has the calibration, notes and description of the
+topics that counted live, and `DROPPED_TOPIC` names the messages that were late, dropped or unreadable. Without them
+`read_log` gives the rows that the estimator had, so that its estimates are those of the live run, to the bit.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from mcap.writer import Writer
+
+from sonar_graph.calibration import Calibration
+from sonar_graph.errors import LogError
+from sonar_graph.logs.adapters import LogConfig
+from sonar_graph.logs.cdr import Value, definition, encode, parse_definition, short_name
+from sonar_graph.logs.mcap import LIBRARY, ROSBAG2_METADATA, TRANSIENT_LOCAL, Keep, Recording, Topic, seal
+from sonar_graph.logs.roles import DROPPED, Choice
+from sonar_graph.logs.vehicle_setup import METADATA
+
+DROPPED_TOPIC = "/sonar_graph/dropped"
+CHUNK_BYTES = 1 << 20
+LIVE_RATE, LATENESS = "live.rate_hz", "live.lateness_s"
+"""Notes that say how often the live estimator was asked, and its lateness budget."""
+
+
+def dropped_in(recording: Recording) -> dict[tuple[str, int], str]:
+    """Reasons of the messages that the estimator was not given live, by topic and log time."""
+    topic = recording.topics.get(DROPPED_TOPIC)
+    if topic is None or short_name(topic.type_name) != short_name(DROPPED):
+        return {}
+    found = dict[tuple[str, int], str]()
+    for group in topic.messages():
+        columns = zip(group.strings("topic"), group["log_time"].tolist(), group.strings("reason"), strict=True)
+        found |= {(name, log_time_ns): reason for (name,), log_time_ns, (reason,) in columns}
+    return found
+
+
+def leave_out_dropped(recording: Recording) -> dict[str, str]:
+    """Remove these messages; a note that counts them."""
+    dropped = dropped_in(recording)
+    for name in {name for name, _ in dropped}:
+        if name in recording.topics:
+            times_ns = [log_time_ns for topic, log_time_ns in dropped if topic == name]
+            recording.topics[name].leave_out(np.array(times_ns, np.int64))
+    counts = Counter((name, reason) for (name, _), reason in dropped.items())
+    texts = [f"{count} of {name}: {reason}" for (name, reason), count in sorted(counts.items())]
+    return {"log.live": "not given to the estimator live, so left out: " + "; ".join(texts)} if texts else {}
+
+
+def recorded_config(recording: Recording) -> LogConfig | None:
+    """Description of the topics in a log's own record, or None."""
+    text = recording.metadata.get(METADATA, {}).get("log_config")
+    if text is None:
+        return None
+    source = f"{recording.path}: metadata record {METADATA!r}: log_config"
+    try:
+        return LogConfig.parse(json.loads(text), source)
+    except (ValueError, RecursionError, AttributeError) as error:
+        raise LogError(f"{source} is no JSON object: {error}") from error
+
+
+def pinned(config: LogConfig, choices: Mapping[str, Choice]) -> dict[str, Any]:
+    """Tables of a configuration with which a log gets the same topics in the same roles."""
+    tables: dict[str, Any] = {role: dict(table) for role, table in config.tables.items()}
+    for role, choice in choices.items():
+        if choice.topic is None:
+            tables[role] = {"use": False}
+        else:
+            tables.setdefault(role, {})["topic"] = choice.topic
+    return tables
+
+
+class LiveRecord:
+    """Writer of a record; what was written before `flush` survives the end of the process.
+
+    Parameters
+    ----------
+    path
+        A new MCAP file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._stream = path.open("xb")
+        self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, enable_data_crcs=True)
+        self._writer.start(profile="ros2", library=LIBRARY)
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+        self._newest_ns: dict[str, int] = {}
+        self._of_dropped = parse_definition(DROPPED, definition(DROPPED))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._writer.finish()  # type: ignore[no-untyped-call]  # of the mcap package
+        self._stream.close()
+
+    def describe(
+        self, name: str, calibration: Calibration, tables: Mapping[str, Any], notes: Mapping[str, str]
+    ) -> None:
+        """Write what counted: name, calibration with the start, configuration of the topics, and notes."""
+        content = {
+            "name": name,
+            "calibration": calibration.model_dump_json(),
+            "log_config": json.dumps(tables),
+            "notes": json.dumps(dict(notes)),
+        }
+        self._writer.add_metadata(METADATA, seal(content))
+        self.flush()
+
+    def add_topic(self, topic: Topic) -> None:
+        """State name, type and definition of a topic before its first message."""
+        key = f"{topic.type_name}\n{topic.schema_text}"
+        if key not in self._schemas:
+            self._schemas[key] = self._writer.register_schema(
+                topic.type_name, topic.schema_encoding, topic.schema_text.encode()
+            )
+        if topic.is_latched:
+            self._writer.add_metadata("rosbag2", ROSBAG2_METADATA)
+        offers = {"offered_qos_profiles": TRANSIENT_LOCAL} if topic.is_latched else {}
+        self._channels[topic.name] = self._writer.register_channel(
+            topic.name, topic.encoding, self._schemas[key], offers
+        )
+
+    def write(self, topic: str, payload: bytes, arrival_ns: int, sequence: int = 0, sent_ns: int = 0) -> int:
+        """Write a message as it came; its log time, by which it is named: of arrival, and unlike any other's."""
+        log_time_ns = max(arrival_ns, self._newest_ns.get(topic, 0) + 1)
+        self._newest_ns[topic] = log_time_ns
+        self._writer.add_message(self._channels[topic], log_time_ns, payload, sent_ns or log_time_ns, sequence % 2**32)
+        return log_time_ns
+
+    def drop(self, topic: str, log_time_ns: int, reason: str, arrival_ns: int) -> None:
+        """Name a message that the estimator is not given."""
+        if DROPPED_TOPIC not in self._channels:
+            own = Topic(self.path, DROPPED_TOPIC, DROPPED, "cdr", "ros2msg", definition(DROPPED), Keep.ALL)
+            self.add_topic(own)
+        values: dict[str, Value] = {"topic": topic, "log_time": log_time_ns, "reason": reason}
+        self.write(DROPPED_TOPIC, encode(self._of_dropped, 1, values)[0].tobytes(), arrival_ns)
+
+    def flush(self) -> None:
+        """Give all that was written to the operating system, where the end of this process loses nothing of it."""
+        self._writer.flush()  # type: ignore[no-untyped-call]  # of the mcap package

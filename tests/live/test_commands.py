@@ -1,0 +1,88 @@
+"""``live`` and ``play`` as commands: mistakes in one line, and a rehearsal with a crash in it."""
+
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import pytest
+
+from sonar_graph import write_log
+from sonar_graph.cli.main import main
+from sonar_graph.simulation import MissionOptions, simulate_mission
+
+pytest.importorskip("zenoh")
+COMMAND = [sys.executable, "-m", "sonar_graph"]
+
+
+def endpoint():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def said(capsys, *arguments):
+    with pytest.raises(SystemExit) as end:
+        main([str(argument) for argument in arguments])
+    return end.value.code, capsys.readouterr().err
+
+
+def test_a_record_that_is_there_is_not_written_over(tmp_path, capsys):
+    (tmp_path / "record.mcap").write_bytes(b"precious")
+    code, line = said(capsys, "live", "-o", tmp_path)
+    assert code == 2
+    assert "--resume" in line
+    assert (tmp_path / "record.mcap").read_bytes() == b"precious"
+
+
+def test_a_router_that_is_not_there_is_named_before_anything_is_written(tmp_path, capsys):
+    code, line = said(capsys, "live", "-o", tmp_path / "dive", "--connect", "tcp/127.0.0.1:1")
+    assert code == 2
+    assert "tcp/127.0.0.1:1" in line
+    assert not (tmp_path / "dive").exists()
+
+
+def test_an_estimator_that_does_not_exist_is_refused_at_once(tmp_path, capsys):
+    code, line = said(capsys, "live", "-o", tmp_path / "dive", "--estimator", "isam3")
+    assert code == 2
+    assert "isam2" in line
+    assert not (tmp_path / "dive").exists()
+
+
+@pytest.mark.slow
+def test_a_live_run_that_is_killed_and_resumed_equals_the_run_on_its_record(tmp_path):
+    """With both ends as commands: play, live, SIGKILL, live --resume, Ctrl-C, run."""
+    world = simulate_mission(MissionOptions(duration_s=40.0, frame_rate_hz=5.0))
+    write_log(tmp_path / "log.mcap", world)
+    where, go = endpoint(), tmp_path / "go"
+    player = subprocess.Popen([*COMMAND, "play", tmp_path / "log.mcap", "--listen", where, "--after", go])
+    time.sleep(3.0)
+    try:
+        live = begun(tmp_path / "first", where)
+        go.touch()
+        time.sleep(12.0)
+        live.kill()
+        live.communicate()
+        live = begun(tmp_path / "second", where, "--resume", str(tmp_path / "first" / "record.mcap"))
+        assert player.wait(120) == 0
+        time.sleep(1.0)
+        live.send_signal(signal.SIGINT)
+        output, _ = live.communicate(timeout=120)
+    finally:
+        player.kill()
+    assert live.returncode == 0, output
+    subprocess.run([*COMMAND, "run", tmp_path / "second/record.mcap", "-o", tmp_path / "again"], check=True)
+    for name in ("causal.tum", "trajectory.tum", "landmarks.csv"):
+        mine, theirs = ((tmp_path / folder / "runs/isam2" / name).read_bytes() for folder in ("second", "again"))
+        assert mine == theirs
+        assert mine.count(b"\n") > 5
+
+
+def begun(folder, where, *options):
+    command = [*COMMAND, "live", "-o", str(folder), "--connect", where, *options]
+    live = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    for line in live.stdout:
+        if "listening" in line:
+            return live
+    raise AssertionError("live ended before it listened")

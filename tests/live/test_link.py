@@ -1,0 +1,126 @@
+"""Live over the loopback: programs that are not ours read what is sent, and feed what is received."""
+
+import socket
+import threading
+import time
+from contextlib import ExitStack
+
+import mcap_ros2._dynamic as ros2
+import numpy as np
+import pytest
+
+from sonar_graph import Sequence, read_log, write_log
+from sonar_graph.errors import LogError
+from sonar_graph.live import LiveOptions, LiveRun, open_outlets, open_session, subscribe
+from sonar_graph.live.outlets import TOPICS
+from sonar_graph.live.zenoh_link import definition_of, parse_key, topic_key, type_hash
+from sonar_graph.logs import PartialCalibration
+from sonar_graph.logs.live_record import LiveRecord
+from sonar_graph.simulation import MissionOptions, simulate_mission
+from tests.live.traffic import messages_of
+
+zenoh = pytest.importorskip("zenoh")
+
+
+@pytest.fixture
+def endpoint():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def test_type_hashes_are_those_of_ros():
+    """RIHS01 of std_msgs/String, as every installation of ROS 2 since Iron prints it."""
+    expected = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
+    assert type_hash("std_msgs/msg/String") == expected
+
+
+def test_a_key_gives_topic_and_type_again():
+    key = topic_key(7, "/nav/imu/data", "sensor_msgs/msg/Imu", "RIHS01_x")
+    assert key == "7/nav/imu/data/sensor_msgs::msg::dds_::Imu_/RIHS01_x"
+    assert parse_key(key) == ("/nav/imu/data", "sensor_msgs/msg/Imu")
+    assert parse_key("0/some/thing/else") is None
+
+
+def test_an_unreachable_router_is_named():
+    with pytest.raises(LogError, match=r"tcp/127\.0\.0\.1:1: zenoh cannot connect"):
+        open_session(["tcp/127.0.0.1:1"])
+
+
+@pytest.fixture
+def mission(tmp_path) -> Sequence:
+    world = simulate_mission(MissionOptions(duration_s=20.0, frame_rate_hz=5.0))
+    write_log(tmp_path / "log.mcap", world)
+    return world
+
+
+def foreign_publisher(endpoint, messages, ready):
+    """A plain zenoh program in the form of rmw_zenoh, which is the router too, at 2.5 times the pace of the log."""
+    config = zenoh.Config()
+    for key, value in (("mode", '"router"'), ("listen/endpoints", f'["{endpoint}"]')):
+        config.insert_json5(key, value)
+    with zenoh.open(config) as session:
+        ready["router"].set()
+        ready["subscribed"].wait(60)
+        first_ns, begun_s = messages[0].arrival_ns, time.monotonic()
+        for number, message in enumerate(messages):
+            time.sleep(max(0.0, begun_s + (message.arrival_ns - first_ns) * 4e-10 - time.monotonic()))
+            package, _, name = message.type_name.split("/")
+            key = f"0{message.topic}/{package}::msg::dds_::{name}_/RIHS01_{'0' * 64}"
+            sender = message.topic.encode().ljust(16)[:16]
+            attachment = number.to_bytes(8, "little") + time.time_ns().to_bytes(8, "little") + b"\x10" + sender
+            session.put(key, message.payload, attachment=attachment)
+        ready["done"].set()
+        ready["end"].wait(60)
+
+
+def test_strangers_feed_it_and_read_every_topic(tmp_path, mission, endpoint):
+    ready = {name: threading.Event() for name in ("router", "subscribed", "done", "end")}
+    messages = messages_of(tmp_path / "log.mcap", np.random.default_rng(0), 0.0)
+    robot = threading.Thread(target=foreign_publisher, args=(endpoint, messages, ready))
+    robot.start()
+    heard: dict[str, list[bytes]] = {}
+    try:
+        assert ready["router"].wait(10)
+        config = zenoh.Config()
+        for key, value in (("mode", '"client"'), ("connect/endpoints", f'["{endpoint}"]')):
+            config.insert_json5(key, value)
+        with zenoh.open(config) as listener, open_session([endpoint]) as session:
+            listener.declare_subscriber(
+                "0/**", lambda s: heard.setdefault(str(s.key_expr), []).append(s.payload.to_bytes())
+            )
+            with LiveRecord(tmp_path / "record.mcap") as record, ExitStack() as stack:
+                given = PartialCalibration(mission.calibration.model_dump(mode="json"), "of the mission")
+                options = LiveOptions("ekf-slam", lateness_s=1.0, calibration=given)
+                outlets = open_outlets(session, 0, None)
+                run = stack.enter_context(LiveRun(record, definition_of, options, outlets, lambda _: None))
+                subscriptions = subscribe(session, 0, run.accept)
+                time.sleep(0.5)
+                ready["subscribed"].set()
+                last_s = time.monotonic() + 60
+                while not ready["done"].is_set() and time.monotonic() < last_s:
+                    run.turn()
+                for _ in range(20):
+                    run.turn()
+                for one in subscriptions:
+                    one.undeclare()
+                outcome = run.finish()
+    finally:
+        ready["subscribed"].set()
+        ready["end"].set()
+        robot.join()
+    record_read = read_log(tmp_path / "record.mcap")
+    assert len(record_read.imu) == len(mission.imu)
+    assert len(outcome.causal) >= 0.9 * mission.duration_s * 10
+    for topic, kind in TOPICS.items():
+        key = topic_key(0, topic, kind, type_hash(kind))
+        assert key in heard, f"nothing was heard of {topic}"
+        decode = ros2.generate_dynamic(kind.replace("/msg/", "/"), definition_of(kind))[kind.replace("/msg/", "/")]
+        read = [decode(payload) for payload in heard[key]]
+        assert len(read) == len(heard[key])
+    odometry = ros2.generate_dynamic("nav_msgs/Odometry", definition_of("nav_msgs/msg/Odometry"))["nav_msgs/Odometry"]
+    key = topic_key(0, "/sonar_graph/odometry", "nav_msgs/msg/Odometry", type_hash("nav_msgs/msg/Odometry"))
+    last = odometry(heard[key][-1])
+    at_ns = last.header.stamp.sec * 10**9 + last.header.stamp.nanosec
+    place, truth = last.pose.pose.position, mission.truth.at(np.array([at_ns]))
+    assert np.linalg.norm(truth.positions[0] - [place.x, place.y, place.z]) < 0.1

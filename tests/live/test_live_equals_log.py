@@ -1,0 +1,145 @@
+"""Live equals log, to the bit: messages in the order of arrival against the record of them, read as a log."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sonar_graph import Odometry, load_estimator, read_log, write_log
+from sonar_graph.live import Engine, Message, recorded_messages
+from sonar_graph.live.zenoh_link import definition_of
+from sonar_graph.logs.live_record import LiveRecord
+from sonar_graph.testing import aided_world, small_world
+from tests.live.traffic import messages_of
+
+NS = 1_000_000_000
+
+
+def live(path: Path, messages: list[Message], rate_hz: float = 10.0, lateness_s: float = 0.25):
+    with LiveRecord(path) as record:
+        engine = Engine(record, definition_of, rate_hz=rate_hz, lateness_s=lateness_s)
+        steps = []
+        for message in messages:
+            engine.take(message)
+            steps += engine.steps()
+        steps += engine.finish()
+    return engine, steps
+
+
+def same_blocks(mine, theirs):
+    assert (mine is None) == (theirs is None)
+    if mine is not None:
+        for name, column in vars(mine).items():
+            assert np.array_equal(column, getattr(theirs, name), equal_nan=True), name
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.2, 0.6])
+@pytest.mark.parametrize("world", [small_world, aided_world])
+def test_a_record_gives_the_steps_that_were_live(tmp_path, world, delay_s):
+    """With messages that come late by random times, also later than the budget, which are then dropped by name."""
+    write_log(tmp_path / "log.mcap", world())
+    messages = messages_of(tmp_path / "log.mcap", np.random.default_rng(3), delay_s)
+    engine, steps = live(tmp_path / "record.mcap", messages)
+    assert bool(engine.counts.dropped) == (delay_s > 0.25)
+    record = read_log(tmp_path / "record.mcap")
+    assert record.calibration == engine.calibration
+    replayed = list(record.replay(record.instants(10.0)))
+    assert [step.end_ns for step in steps] == [step.end_ns for step in replayed]
+    for mine, theirs in zip(steps, replayed, strict=True):
+        for name in record.blocks():
+            same_blocks(getattr(mine, name), getattr(theirs, name))
+
+
+@pytest.mark.parametrize("name", ["isam2", "ekf-slam", "invariant-ekf", "dead-reckoning"])
+def test_estimates_of_a_record_are_those_of_the_live_run_to_the_bit(tmp_path, name):
+    write_log(tmp_path / "log.mcap", small_world())
+    messages = messages_of(tmp_path / "log.mcap", np.random.default_rng(5), 0.4)
+    _, steps = live(tmp_path / "record.mcap", messages)
+    record = read_log(tmp_path / "record.mcap")
+    bits = []
+    for given in (steps, record.replay(record.instants(10.0))):
+        estimator = load_estimator(name)(record.calibration, Odometry(record.calibration))
+        estimates = [estimator.process(step) for step in given]
+        bits.append(b"".join(e.world_T_body.matrix().tobytes() + e.covariance.tobytes() for e in estimates if e))
+    assert bits[0] == bits[1]
+    assert bits[0]
+
+
+def test_a_record_whose_writer_was_killed_goes_on_as_if_nothing_had_been(tmp_path):
+    """Half a record, cut within its last chunk, and the rest of the messages: the same steps as of one record."""
+    write_log(tmp_path / "log.mcap", small_world())
+    messages = messages_of(tmp_path / "log.mcap", np.random.default_rng(5), 0.4)
+    _, steps = live(tmp_path / "whole.mcap", messages)
+    with LiveRecord(tmp_path / "half.mcap") as half:
+        engine = Engine(half, definition_of)
+        for message in messages[: len(messages) // 2]:
+            engine.take(message)
+            list(engine.steps())
+        half.flush()
+        written = (tmp_path / "half.mcap").read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(written[: 6 * len(written) // 10])
+    kept = list(recorded_messages(tmp_path / "cut.mcap"))
+    assert 0 < len(kept) < len(messages) // 2
+    again = [*kept, *messages[len(kept) :]]
+    _, resumed = live(tmp_path / "resumed.mcap", again)
+    assert [step.end_ns for step in resumed] == [step.end_ns for step in steps]
+    for mine, theirs in zip(resumed, steps, strict=True):
+        for name in ("imu", "dvl", "depth", "detections"):
+            same_blocks(getattr(mine, name), getattr(theirs, name))
+
+
+def test_what_an_estimator_that_was_behind_did_not_get_is_not_in_the_record(tmp_path):
+    write_log(tmp_path / "log.mcap", small_world())
+    messages = messages_of(tmp_path / "log.mcap", np.random.default_rng(5), 0.0)
+    with LiveRecord(tmp_path / "record.mcap") as record:
+        engine = Engine(record, definition_of)
+        steps = []
+        for message in messages:
+            engine.take(message)
+            steps += [engine.without_detections(s, message.arrival_ns) for s in engine.steps()]
+        steps += [engine.without_detections(s, messages[-1].arrival_ns) for s in engine.finish()]
+    assert all(step.detections is None for step in steps)
+    assert sum(engine.counts.dropped.values()) >= 30
+    assert read_log(tmp_path / "record.mcap").detections is None
+
+
+def test_gaps_of_sequence_numbers_are_losses_by_topic(tmp_path):
+    write_log(tmp_path / "log.mcap", small_world())
+    numbers: dict[str, int] = {}
+    messages = []
+    for message in messages_of(tmp_path / "log.mcap", np.random.default_rng(5), 0.0):
+        numbers[message.topic] = number = numbers.get(message.topic, 0) + 1
+        if message.topic != "/dvl/data" or number % 10 != 5:
+            messages.append(message._replace(sequence=number))
+    engine, _ = live(tmp_path / "record.mcap", messages)
+    assert +engine.counts.lost == {"/dvl/data": 10}
+
+
+def test_a_sensor_whose_first_message_comes_late_is_in_all_steps(tmp_path):
+    """Detections begin after five seconds: all steps are given anew, and the record gives the last ones."""
+    world = small_world()
+    write_log(tmp_path / "log.mcap", world)
+    late_ns = world.start_ns + 5 * NS
+    messages = [
+        message
+        for message in messages_of(tmp_path / "log.mcap", np.random.default_rng(5), 0.4)
+        if message.topic != "/sonar/landmarks" or message.arrival_ns > late_ns
+    ]
+    with LiveRecord(tmp_path / "record.mcap") as record:
+        engine, generation, steps = Engine(record, definition_of), 0, []
+        for message in messages:
+            engine.take(message)
+            if engine.generation != generation:
+                generation, steps = engine.generation, []
+            steps += engine.steps()
+        steps += engine.finish()
+    assert generation == 1
+    replayed = read_log(tmp_path / "record.mcap")
+    assert replayed.detections.stamps_ns[0] > late_ns - NS
+    assert replayed.calibration == engine.calibration
+    assert engine.calibration.sonar.mounting.translation_m == pytest.approx(
+        world.calibration.sonar.mounting.translation_m
+    )
+    for mine, theirs in zip(steps, replayed.replay(replayed.instants(10.0)), strict=True):
+        for name in ("imu", "dvl", "depth", "detections"):
+            same_blocks(getattr(mine, name), getattr(theirs, name))
