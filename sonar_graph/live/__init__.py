@@ -7,9 +7,9 @@ from sonar_graph import at_first_use
 
 if TYPE_CHECKING:
     from sonar_graph.live.arrivals import Arrivals
-    from sonar_graph.live.engine import Engine
+    from sonar_graph.live.engine import Engine, LiveOptions
     from sonar_graph.live.live_messages import Message, dropped_messages, play_messages, recorded_messages
-    from sonar_graph.live.node import LiveOptions, LiveRun, write_outcome
+    from sonar_graph.live.node import LiveRun, write_outcome
     from sonar_graph.live.outlets import open_outlets
     from sonar_graph.live.predictor import Prediction, Predictor
     from sonar_graph.live.zenoh_link import DEFAULT_ROUTER, Publisher, definition_of, open_session, subscribe

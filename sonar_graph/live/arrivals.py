@@ -99,7 +99,7 @@ class Arrivals:
             self._stamps_ns[sensor].add(stamp_ns)
             self._waiting[sensor].append(block)
             if len(self._waiting[sensor]) > MOST_PARTS:
-                self._waiting[sensor] = [_joined(self._waiting[sensor])]
+                self._waiting[sensor] = [joined(self._waiting[sensor])]
             self._first_ns[sensor] = min(stamp_ns, self._first_ns.get(sensor, stamp_ns))
         self.newest_ns[sensor] = max(stamp_ns, self.newest_ns.get(sensor, stamp_ns))
         self._last_arrival_ns = arrival_ns
@@ -135,7 +135,7 @@ class Arrivals:
         rows: dict[str, Any] = {}
         for name, parts in self._waiting.items():
             if parts:
-                block = _joined(parts)
+                block = joined(parts)
                 rows[name] = block.between(after_ns, end_ns)
                 left = block.between(end_ns, int(block.stamps_ns[-1]))
                 self._waiting[name] = [] if left is None else [left]
@@ -144,7 +144,7 @@ class Arrivals:
         return Measurements(end_ns, **rows)
 
 
-def _joined(parts: list[Any]) -> Any:
+def joined(parts: list[Any]) -> Any:
     """One block in the order of stamps; of equal ones in that of arrival."""
     if len(parts) == 1:
         return parts[0]

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -32,6 +33,7 @@ from sonar_graph.logs import (
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.logs.mcap import Keep, Recording, Topic
 from sonar_graph.measurements import BLOCKS, NS_PER_S, Measurements
+from sonar_graph.sequence import Sequence
 
 OVERLOADED = "overload: the estimator was behind"
 SETUP_NS = 2 * NS_PER_S
@@ -46,6 +48,19 @@ class Counts:
     """Numbers that are missing between the sequence numbers of a sender."""
     dropped: Counter[tuple[str, str]] = field(default_factory=Counter)
     """By topic and reason."""
+
+
+@dataclass
+class LiveOptions:
+    """Choices of a live run."""
+
+    estimator: str = "isam2"
+    overrides: Mapping[str, Any] = field(default_factory=dict)
+    rate_hz: float = 10.0
+    lateness_s: float = 0.25
+    topics: Mapping[str, str] = field(default_factory=dict)
+    config: LogConfig | None = None
+    calibration: PartialCalibration | None = None
 
 
 class Engine:
@@ -77,8 +92,13 @@ class Engine:
         self.counts = Counts()
         self.calibration: Calibration | None = None
         """Known once the first seconds are over."""
+        self.sequence: Sequence | None = None
+        """What the messages of these were."""
+        self.log_time_ns = 0
+        """Name of the newest message in the record."""
         self.notes: dict[str, str] = {}
         """Notes of these, as `read_log` gives them."""
+        self.record_path = record.path
         self._record = record
         self._definition_of = definition_of
         self._arrivals = Arrivals(rate_hz, lateness_s)
@@ -93,7 +113,8 @@ class Engine:
         self._dropped: dict[tuple[str, int], str] = {}
         """Messages that were dropped before all began anew."""
         self._first_motion_ns: int | None = None
-        self._in_use: set[str] = set()
+        self.in_use: set[str] = set()
+        """Roles that have a topic."""
         self._reader: MessageReader | None = None
         self._sequence: dict[tuple[str, bytes], int] = {}
         self._detections: dict[int, list[tuple[str, int]]] = {}
@@ -113,9 +134,11 @@ class Engine:
             if place in self._sequence:
                 self.counts.lost[name] += max(message.sequence - self._sequence[place] - 1, 0)
             self._sequence[place] = max(message.sequence, self._sequence.get(place, 0))
-        log_time_ns = self._record.write(name, message.payload, message.arrival_ns, message.sequence, message.sent_ns)
+        log_time_ns = self.log_time_ns = self._record.write(
+            name, message.payload, message.arrival_ns, message.sequence, message.sent_ns
+        )
         if dropped == OVERLOADED:  # all other reasons are found again
-            self._drop(name, log_time_ns, OVERLOADED, message.arrival_ns)
+            self.drop(name, log_time_ns, OVERLOADED, message.arrival_ns)
             return []
         if is_new and self._reader is not None and self._brings_a_sensor():
             self._begin_anew()
@@ -144,23 +167,23 @@ class Engine:
         if step.detections is not None:
             for stamp_ns in np.unique(step.detections.stamps_ns).tolist():
                 for topic, log_time_ns in self._detections.pop(stamp_ns, ()):
-                    self._drop(topic, log_time_ns, OVERLOADED, arrival_ns)
+                    self.drop(topic, log_time_ns, OVERLOADED, arrival_ns)
         return replace(step, detections=None)
 
     def _add_topic(self, message: Message) -> None:
         is_latched = message.topic.endswith("_static")
         text = self._definition_of(message.type_name)
         kind = message.type_name
-        topic = Topic(self._record.path, message.topic, kind, "cdr", "ros2msg", text, Keep.ALL, is_latched=is_latched)
+        topic = Topic(self.record_path, message.topic, kind, "cdr", "ros2msg", text, Keep.ALL, is_latched=is_latched)
         self.topics[message.topic] = topic
         self._record.add_topic(topic)
 
     def _choices(self) -> dict[str, Choice]:
-        return choose_each(Recording(self._record.path, self.topics), self._wanted, self._config)
+        return choose_each(Recording(self.record_path, self.topics), self._wanted, self._config)
 
     def _brings_a_sensor(self) -> bool:
         """Tell whether a topic that has just come is of a sensor that had none, such as the first detections."""
-        return any(c.topic is not None for role, c in self._choices().items() if role in BLOCKS.keys() - self._in_use)
+        return any(c.topic is not None for role, c in self._choices().items() if role in BLOCKS.keys() - self.in_use)
 
     def _begin_anew(self) -> None:
         """Give all steps again from the record, with a sensor whose topic came late.
@@ -168,8 +191,8 @@ class Engine:
         Its mounting is part of the calibration, which an estimator has from its beginning.
         """
         self._record.flush()
-        self._first = [(message, message.arrival_ns) for message in recorded_messages(self._record.path)]
-        self._dropped = dropped_messages(self._record.path)
+        self._first = [(message, message.arrival_ns) for message in recorded_messages(self.record_path)]
+        self._dropped = dropped_messages(self.record_path)
         self._arrivals, self._reader = Arrivals(self._rate_hz, self._lateness_s), None
         self._detections.clear()
         self.generation += 1
@@ -186,14 +209,14 @@ class Engine:
         for held, log_time_ns in self._first:
             size = np.array([len(held.payload)])
             topics[held.topic].gather(held.payload, np.zeros(1, np.int64), size, np.array([log_time_ns]))
-        recording = Recording(self._record.path, topics)
+        recording = Recording(self.record_path, topics)
         choices = choose_topics(recording, self._wanted, self._config)
         assembly = Assembly(recording, choices, self._given)
         sequence = assembly.sequence("live")
-        self.calibration, self.notes = sequence.calibration, sequence.notes
-        self._record.describe(self._record.path.stem, self.calibration, pinned(self._config, choices), self._said)
+        self.sequence, self.calibration, self.notes = sequence, sequence.calibration, sequence.notes
+        self._record.describe(self.record_path.stem, self.calibration, pinned(self._config, choices), self._said)
         self._reader = MessageReader(assembly)
-        self._in_use = {role for role, choice in choices.items() if choice.topic is not None}
+        self.in_use = {role for role, choice in choices.items() if choice.topic is not None}
         return True
 
     def _parts(self, message: Message, log_time_ns: int) -> list[Part]:
@@ -209,7 +232,7 @@ class Engine:
             if part.role == "detections" and part.block is not None:
                 self._detections.setdefault(part.stamp_ns, []).append((message.topic, log_time_ns))
         if reasons and not parts:
-            self._drop(message.topic, log_time_ns, reasons[0], message.arrival_ns)
+            self.drop(message.topic, log_time_ns, reasons[0], message.arrival_ns)
         return parts
 
     def _counted(self, step: Measurements) -> Measurements:
@@ -218,6 +241,7 @@ class Engine:
             del self._detections[stamp_ns]
         return step
 
-    def _drop(self, topic: str, log_time_ns: int, reason: str, arrival_ns: int) -> None:
+    def drop(self, topic: str, log_time_ns: int, reason: str, arrival_ns: int) -> None:
+        """Name a message in the record as not used."""
         self.counts.dropped[topic, reason] += 1
         self._record.drop(topic, log_time_ns, reason, arrival_ns)

@@ -14,7 +14,6 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
@@ -22,12 +21,23 @@ import gtsam
 import numpy as np
 
 from sonar_graph.errors import EstimatorError, LogError
-from sonar_graph.live.engine import Engine
+from sonar_graph.live.engine import Engine, LiveOptions
+from sonar_graph.live.live_images import LiveImages
 from sonar_graph.live.live_messages import Message
-from sonar_graph.live.outlets import OWN, Outlet, PoseForms, payload_of_pose, payload_of_state, payloads_of_map
+from sonar_graph.live.outlets import (
+    DETECTED,
+    OWN,
+    TOPICS,
+    Outlet,
+    PoseForms,
+    payload_of_detections,
+    payload_of_pose,
+    payload_of_state,
+    payloads_of_map,
+)
 from sonar_graph.live.predictor import Predictor
 from sonar_graph.live.worker import Answer, LiveOutcome, Worker
-from sonar_graph.logs import ROLES, LiveRecord, PartialCalibration, wanted_types
+from sonar_graph.logs import ROLES, LiveRecord, wanted_types
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.logs.cdr import short_name
 from sonar_graph.sequence import Sequence
@@ -72,19 +82,6 @@ class Inbox:
             self._messages.clear()
             self._bytes = 0
             return messages
-
-
-@dataclass
-class LiveOptions:
-    """Choices of a live run."""
-
-    estimator: str = "isam2"
-    overrides: Mapping[str, Any] = field(default_factory=dict)
-    rate_hz: float = 10.0
-    lateness_s: float = 0.25
-    topics: Mapping[str, str] = field(default_factory=dict)
-    config: LogConfig | None = None
-    calibration: PartialCalibration | None = None
 
 
 class LiveRun:
@@ -139,6 +136,7 @@ class LiveRun:
         )
         warm_predictor(warm_up)
         self._predictor: Predictor | None = None
+        self._images = LiveImages(self.engine, options)
         self._is_failed = False
         self._is_quiet = False  # while what an earlier run had is taken in: nobody waits for those poses
         self._generation = -1
@@ -146,6 +144,11 @@ class LiveRun:
         self._withheld: list[str] = []
         self._latency_ns = self._estimates = self._newest_ns = 0
         self._longest_update_s = 0.0
+
+    @property
+    def images_waiting(self) -> int:
+        """Number of sonar images that are being recognised."""
+        return self._images.waiting
 
     def accept(self, message: Message) -> None:
         """Put a message into the inbox, if it is of use; called by the transport's thread."""
@@ -191,6 +194,12 @@ class LiveRun:
             self._take(message)
         while self._answers:
             self._use(self._answers.popleft())
+        if failure := self._images.failure():
+            self._said(failure)
+        for stamp_ns, detections in self._images.recognised():
+            payload = payload_of_detections(detections, stamp_ns)
+            self._put(DETECTED, payload)
+            self._take(Message(DETECTED, TOPICS[DETECTED], payload, time.time_ns()))
         now_s = time.monotonic()
         if now_s > self._flushed_s + FLUSH_S:
             self._record.flush()
@@ -223,6 +232,7 @@ class LiveRun:
 
     def __exit__(self, *_: object) -> None:
         self._worker.end()
+        self._images.end()
 
     def _take(self, message: Message, dropped: str | None = None) -> None:
         if message.topic in self._unused:
@@ -237,6 +247,8 @@ class LiveRun:
             return
         if self.engine.calibration is not None and self._generation != self.engine.generation:
             self._begin()
+        if not self._is_quiet:
+            self._images.take(message, parts)
         for part in parts:
             if self._predictor is None or part.role not in ("imu", "dvl") or part.block is None:
                 continue
@@ -298,6 +310,7 @@ class LiveRun:
             "longest_update_ms": f"{self._longest_update_s * 1e3:.1f}",
             "predictor_p99_us": f"{1e6 * np.percentile(self.predict_s or [np.nan], 99):.0f}",
             "steps_waiting": str(self._worker.waiting),
+            "images_waiting": str(self.images_waiting),
             "estimates": str(self._estimates),
             "lost": ", ".join(f"{name} {n}" for name, n in sorted(lost.items())) or "none",
             "dropped": ", ".join(f"{name} {n} {why}" for (name, why), n in sorted(counts.dropped.items())) or "none",

@@ -6,6 +6,7 @@
 ``/sonar_graph/pose``      ``geometry_msgs/PoseWithCovarianceStamped``: the estimates themselves
 ``/sonar_graph/landmarks`` ``sonar_graph_msgs/LandmarkMap``
 ``/sonar_graph/markers``   ``visualization_msgs/MarkerArray``: the same for viewers, 95 % ellipsoids
+``/sonar_graph/detections``  ``sonar_graph_msgs/LandmarkDetections`` of each sonar image that was recognised here
 ``/sonar_graph/state``     ``diagnostic_msgs/DiagnosticArray``: latency, queue, losses, what is withheld
 =========================  ===================================================================================
 """
@@ -21,16 +22,17 @@ import numpy as np
 from sonar_graph.errors import LogError
 from sonar_graph.live.predictor import Prediction
 from sonar_graph.live.zenoh_link import Publisher
-from sonar_graph.logs import landmark_map_message, landmark_markers, pose_messages
+from sonar_graph.logs import detection_messages, landmark_map_message, landmark_markers, pose_messages
 from sonar_graph.logs.adapters import body_to_ros
 from sonar_graph.logs.cdr import Bytes, Decoder, Messages, definition, encode, parse_definition
-from sonar_graph.measurements import NS_PER_S
+from sonar_graph.measurements import NS_PER_S, LandmarkDetections
 from sonar_graph.states import Estimate, LandmarkMap, Trajectory
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 TF = "tf2_msgs/msg/TFMessage"
 MARKERS = "visualization_msgs/msg/MarkerArray"
 STATE = "diagnostic_msgs/msg/DiagnosticArray"
+DETECTED = "/sonar_graph/detections"
 TOPICS = {
     "/sonar_graph/odometry": ODOMETRY,
     "/tf": TF,
@@ -38,6 +40,7 @@ TOPICS = {
     "/sonar_graph/landmarks": "sonar_graph_msgs/msg/LandmarkMap",
     "/sonar_graph/markers": MARKERS,
     "/sonar_graph/state": STATE,
+    DETECTED: "sonar_graph_msgs/msg/LandmarkDetections",
 }
 OWN = "/sonar_graph/"
 WORLD_FRAME, ODOM_FRAME, BODY_FRAME = "map", "odom", "base_link"
@@ -80,6 +83,15 @@ def payload_of_pose(estimate: Estimate) -> bytes:
     """``PoseWithCovarianceStamped`` of an estimate."""
     entry = pose_messages("", Trajectory.from_estimates([estimate]))
     return entry.payloads[0].tobytes()
+
+
+def payload_of_detections(detections: LandmarkDetections | None, stamp_ns: int) -> bytes:
+    """``LandmarkDetections`` of a sonar image, also of one without any."""
+    if detections is not None:
+        return detection_messages("", detections)[0].payloads[0].tobytes()
+    seconds, nanoseconds = divmod(stamp_ns, NS_PER_S)
+    struct = parse_definition(TOPICS[DETECTED], definition(TOPICS[DETECTED]))
+    return encode(struct, 1, {"header.stamp.sec": seconds, "header.stamp.nanosec": nanoseconds})[0].tobytes()
 
 
 def payloads_of_map(landmarks: LandmarkMap, stamp_ns: int) -> tuple[bytes, bytes]:

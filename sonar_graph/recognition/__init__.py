@@ -10,14 +10,14 @@ from sonar_graph.recognition.recognition_record import (
     PICTURE_FOLDER, RECOGNITION, SEE_TRACKS, SURE, DrawnFrame, Recognition, read_recognition, write_recognition,
 )
 from sonar_graph.recognition.session import (
-    NO_FLOOR, LandmarkRecogniser, one_by_one, recognise, recognise_images, with_detections,
+    NO_FLOOR, LandmarkRecogniser, RecognitionSession, one_by_one, recognise, recognise_images, with_detections,
 )
 from sonar_graph.recognition.track_stories import TrackStories, TrackStory
 
 __all__ = [
     "ClockOffset", "DrawnFrame", "ImageMotions", "LabelDesk", "LabelServer", "LabelledLog", "Labels",
     "LandmarkRecogniser", "MotionFrom", "NO_FLOOR", "PICTURE_FOLDER", "PlanarStep", "RECOGNITION", "Recognition",
-    "SEE_TRACKS", "SURE", "TrackStories", "TrackStory", "calibrate", "calibrate_by_labels", "estimate_offset",
-    "one_by_one", "read_labels", "read_recognition", "recognise", "recognise_images", "shown_frames",
-    "with_detections", "write_recognition",
+    "RecognitionSession", "SEE_TRACKS", "SURE", "TrackStories", "TrackStory", "calibrate", "calibrate_by_labels",
+    "estimate_offset", "one_by_one", "read_labels", "read_recognition", "recognise", "recognise_images",
+    "shown_frames", "with_detections", "write_recognition",
 ]

@@ -23,7 +23,7 @@ from sonar_graph.logs import ImagesAlone, PartialCalibration, read_log, read_son
 from sonar_graph.logs import no_images as no_images
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.logs.mcap import TimeWindow
-from sonar_graph.measurements import NS_PER_S, LandmarkDetections
+from sonar_graph.measurements import NS_PER_S, Depth, Dvl, Imu, LandmarkDetections
 from sonar_graph.recognition.image_motion import ImageMotions, MotionFrom
 from sonar_graph.recognition.recognition_record import DrawnFrame, Recognition, as_jpeg, draw_fan
 from sonar_graph.recognition.sonar_motion import SonarMotions
@@ -247,6 +247,15 @@ class RecognitionSession:
         for frame in without_leaps(frames, self.refuse):
             self.take(frame)
             yield int(frame.stamps_ns[0])
+
+    def extend(self, imu: Imu | None, dvl: Dvl | None, depth: Depth | None) -> None:
+        """Take in rows of the other sensors that have come since, where the images come live."""
+        if isinstance(self._motions, SonarMotions):
+            self._motions.extend(imu, dvl, depth)
+
+    def forget(self) -> None:
+        """Forget what only the record of the whole run needs, where there is no end."""
+        self._blocks.clear()
 
     def take(self, frame: SonarFrames) -> LandmarkDetections | None:
         """Take in a block of one frame."""

@@ -6,7 +6,7 @@ depth and the calibration's floor. Nothing stamped after a frame is used for it.
 
 import numpy as np
 
-from sonar_graph.measurements import NS_PER_S, Depth, Floats
+from sonar_graph.measurements import NS_PER_S, Depth, Dvl, Floats, Imu
 from sonar_graph.navigation import MotionSource, Odometry, PreintegratedMotion
 from sonar_graph.navigation.alignment import gravity_direction
 from sonar_graph.sequence import Sequence
@@ -14,6 +14,8 @@ from sonar_graph.sonar import FloorView, SonarStep
 
 GRAVITY_INTERVAL_NS = NS_PER_S
 """Shortest time over which accelerometers are averaged; the noise of velocity at its ends falls with its square."""
+KEPT_NS = 60 * NS_PER_S
+"""Rows of a live run that are kept before the last frame, for a sensor that is late."""
 _NO_BIAS = np.zeros(3)
 
 
@@ -72,6 +74,12 @@ class _Height:
         self.z_m += climbed_m
         self.variance += variance_m2
 
+    def add(self, depth: Depth) -> None:
+        """Take in samples that have come since; those before the last frame are forgotten."""
+        kept = None if self._depth is None else self._depth.between(self._stamp_ns, int(self._depth.stamps_ns[-1]))
+        parts = [part for part in (kept, depth) if part is not None]
+        self._depth = Depth.concatenate(parts)
+
     def correct(self, up: Floats, until_ns: int) -> None:
         """Correct by the latest of the depth samples since the last call."""
         rows = None if self._depth is None else self._depth.between(self._stamp_ns, until_ns)
@@ -99,6 +107,17 @@ class SonarMotions:
         self._start_ns, self._end_ns = sequence.start_ns, sequence.end_ns
         self._stamp_ns = sequence.start_ns
         self._is_first = True
+
+    def extend(self, imu: Imu | None, dvl: Dvl | None, depth: Depth | None) -> None:
+        """Take in rows that have come since; a frame up to the newest IMU row is then covered."""
+        self._odometry.add(imu, dvl)
+        if imu is not None:
+            self._end_ns = max(self._end_ns, int(imu.stamps_ns[-1]))
+        if depth is not None:
+            self._height.add(depth)
+        settled_ns = min(self._stamp_ns, self._tilt.epoch_ns)
+        if settled_ns > self._start_ns + KEPT_NS:
+            self._odometry.forget_before(settled_ns - KEPT_NS)
 
     def covers(self, stamp_ns: int) -> bool:
         """True for an instant with IMU and Doppler log, not before the last one asked for."""

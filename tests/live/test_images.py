@@ -1,0 +1,49 @@
+"""Sonar images of a live run are recognised as those of a log are, and the record has what was recognised."""
+
+import time
+
+import numpy as np
+import pytest
+
+from sonar_graph import read_log, recognise
+from sonar_graph.cli.main import main
+from sonar_graph.live import LiveOptions, LiveRun
+from sonar_graph.live.zenoh_link import definition_of
+from sonar_graph.logs import LiveRecord
+from tests.live.traffic import messages_of
+
+LOG_S = 40.0
+
+
+@pytest.mark.slow
+def test_live_detections_are_those_of_the_log_and_the_record_has_them(tmp_path):
+    """Each image is waited for; the images of the first two seconds, before the recogniser begins, are missing."""
+    log = tmp_path / "basin.mcap"
+    with pytest.raises(SystemExit):
+        main(["simulate", "basin", "-o", str(log), "--images", "--set", "laps=1", "--set", "duration_s=150"])
+    whole = recognise(log)
+    messages = messages_of(log, np.random.default_rng(0), 0.0)
+    last_ns = messages[0].arrival_ns + int(LOG_S * 1e9)
+    with LiveRecord(tmp_path / "record.mcap") as record:
+        options = LiveOptions("dead-reckoning", lateness_s=5.0)
+        with LiveRun(record, definition_of, options, [], lambda _: None) as run:
+            for message in messages:
+                if message.arrival_ns > last_ns:
+                    break
+                if message.topic == "/sonar/landmarks":
+                    continue
+                run.accept(message)
+                run.turn(0.0)
+                until_s = time.monotonic() + 60
+                while run.images_waiting and time.monotonic() < until_s:
+                    run.turn(0.001)
+            outcome = run.finish()
+    assert len(outcome.causal) > 100
+    recorded = read_log(tmp_path / "record.mcap")
+    assert recorded.detections is not None
+    mine, theirs = recorded.detections, whole.detections.between(0, int(recorded.detections.stamps_ns[-1]))
+    first = np.searchsorted(theirs.stamps_ns, mine.stamps_ns[0])
+    assert len(mine) >= 8
+    assert abs(len(mine) - (len(theirs) - first)) <= 2
+    common = np.intersect1d(mine.stamps_ns, theirs.stamps_ns)
+    assert len(common) >= 0.8 * len(np.unique(mine.stamps_ns))
