@@ -31,7 +31,11 @@ def live(
     output: OutputFolder,
     connect: Annotated[
         list[str] | None,
-        typer.Option(metavar="ENDPOINT", help="zenoh router, as rmw_zenohd or `play` is one; may be repeated."),
+        typer.Option(
+            metavar="ENDPOINT",
+            help="zenoh router (tcp/ADDRESS:7447), as rmw_zenohd or `play` is one; or a foxglove_bridge "
+            "(ws://ADDRESS:8765), to which nothing is sent back.",
+        ),
     ] = None,
     domain: DOMAIN = 0,
     estimator: Annotated[str, typer.Option("--estimator", help="Name of an installed estimator.")] = "isam2",
@@ -63,12 +67,10 @@ def live(
         DEFAULT_ROUTER,
         LiveOptions,
         LiveRun,
-        definition_of,
         dropped_messages,
+        open_link,
         open_outlets,
-        open_session,
         recorded_messages,
-        subscribe,
         write_outcome,
     )
     from sonar_graph.logs import LiveRecord
@@ -81,22 +83,21 @@ def live(
     overrides = estimator_settings(settings, [estimator]).get(estimator, {})
     check_request(estimator, overrides)
     options = LiveOptions(estimator, overrides, rate_hz, lateness, reading.choices, reading.config, reading.given)
-    with open_session(connect or [DEFAULT_ROUTER]) as session, interrupt_event() as ended:
+    with open_link(connect or [DEFAULT_ROUTER], domain) as link, interrupt_event() as ended:
         output.mkdir(parents=True, exist_ok=True)
-        outlets = open_outlets(session, domain, foxglove)
+        outlets = open_outlets(link, foxglove)
         echo("compiling what the estimator needs")
-        with LiveRecord(record) as written, LiveRun(written, definition_of, options, outlets, echo) as run:
+        with LiveRecord(record) as written, LiveRun(written, link.definition_of, options, outlets, echo) as run:
             if resume is not None:
                 last_ns = run.catch_up(recorded_messages(resume), dropped_messages(resume))
                 echo(f"resumed from {resume}: blind for {(time.time_ns() - last_ns) * 1e-9:.1f} s")
             gc.freeze()  # what was loaded is never looked at again, which would delay a pose
-            subscriptions = subscribe(session, domain, run.accept)
-            echo(f"listening in domain {domain}; the record is {record}")
+            link.listen(run.accept, run.wants)
+            echo(f"listening to {', '.join(connect or [DEFAULT_ROUTER])}; the record is {record}")
             last_s = time.monotonic() + (float("inf") if duration is None else duration)
             while not ended.is_set() and time.monotonic() < last_s:
                 run.turn()
-            for one in subscriptions:
-                one.undeclare()
+            link.stop()
             outcome = run.finish()
     if outcome is None:
         raise LogError(f"nothing was estimated: {run.lacking()}; what came is in {record}")

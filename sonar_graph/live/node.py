@@ -150,11 +150,14 @@ class LiveRun:
         """Number of sonar images that are being recognised."""
         return self._images.waiting
 
+    def wants(self, topic: str, type_name: str) -> bool:
+        """Tell whether the messages of a topic may be of use."""
+        return not topic.startswith(OWN) and short_name(type_name) in self._types
+
     def accept(self, message: Message) -> None:
-        """Put a message into the inbox, if it is of use; called by the transport's thread."""
-        if message.topic.startswith(OWN) or short_name(message.type_name) not in self._types:
-            return
-        self.inbox.put(message)
+        """Put a message into the inbox, if it may be of use; called by the transport's thread."""
+        if self.wants(message.topic, message.type_name):
+            self.inbox.put(message)
 
     def catch_up(self, messages: Iterator[Message], dropped: Mapping[tuple[str, int], str]) -> int:
         """Take the messages of an earlier record, with what was dropped then; the time of arrival of the last."""

@@ -20,8 +20,9 @@ import gtsam
 import numpy as np
 
 from sonar_graph.errors import LogError
+from sonar_graph.live.foxglove_link import FoxgloveLink
 from sonar_graph.live.predictor import Prediction
-from sonar_graph.live.zenoh_link import Publisher
+from sonar_graph.live.zenoh_link import Publisher, ZenohLink
 from sonar_graph.logs import detection_messages, landmark_map_message, landmark_markers, pose_messages
 from sonar_graph.logs.adapters import body_to_ros
 from sonar_graph.logs.cdr import Bytes, Decoder, Messages, definition, encode, parse_definition
@@ -193,9 +194,20 @@ class FoxgloveOutlet:
         self._channels[topic].log(payload)
 
 
-def open_outlets(session: Any, domain: int, foxglove_port: int | None) -> list[Outlet]:
-    """Outlets over zenoh and, with a port, for viewers."""
-    outlets: list[Outlet] = [ZenohOutlet(session, domain)]
+Link = ZenohLink | FoxgloveLink
+
+
+def open_link(endpoints: list[str], domain: int) -> Link:
+    """Link to a foxglove_bridge (``ws://...``), or to zenoh routers; a LogError where none is there."""
+    bridges = [one for one in endpoints if one.startswith(("ws://", "wss://"))]
+    if bridges and len(endpoints) > 1:
+        raise LogError(f"{bridges[0]}: a foxglove_bridge is connected to alone; name one endpoint")
+    return FoxgloveLink(bridges[0]) if bridges else ZenohLink(endpoints, domain)
+
+
+def open_outlets(link: Link, foxglove_port: int | None) -> list[Outlet]:
+    """Outlets over zenoh, if that is the link, and, with a port, for viewers."""
+    outlets: list[Outlet] = [ZenohOutlet(link.session, link.domain)] if isinstance(link, ZenohLink) else []
     if foxglove_port is not None:
         outlets.append(FoxgloveOutlet(foxglove_port))
     return outlets

@@ -16,7 +16,7 @@ import struct
 import time
 from collections.abc import Callable, Iterable
 from functools import lru_cache
-from typing import Any
+from typing import Any, Self
 
 from sonar_graph.errors import LogError
 from sonar_graph.live.live_messages import Message
@@ -107,8 +107,13 @@ def open_session(connect: Iterable[str] = (), listen: Iterable[str] = ()) -> Any
         ) from error
 
 
-def subscribe(session: Any, domain: int, received: Callable[[Message], None]) -> Any:
-    """Give every message of a domain to a function, which must return at once: it is called by zenoh's own thread.
+def subscribe(
+    session: Any,
+    domain: int,
+    received: Callable[[Message], None],
+    is_wanted: Callable[[str, str], bool] = lambda *_: True,
+) -> Any:
+    """Give the wanted messages of a domain to a function that returns at once: zenoh's own thread calls it.
 
     Latched transforms that were sent before are given too. What is returned keeps the subscription.
     """
@@ -117,7 +122,7 @@ def subscribe(session: Any, domain: int, received: Callable[[Message], None]) ->
     def take(sample: Any) -> None:
         arrival_ns = time.time_ns()
         found = parse_key(str(sample.key_expr))
-        if found is None:
+        if found is None or not is_wanted(*found):
             return
         sequence, sent_ns, sender = 0, 0, b""
         if sample.attachment is not None and len(data := sample.attachment.to_bytes()) >= ATTACHMENT.size:
@@ -170,3 +175,31 @@ class Publisher:
         """Send one message."""
         self._sequence += 1
         self._publisher.put(payload, attachment=ATTACHMENT.pack(self._sequence, time.time_ns(), 16, self._sender))
+
+
+class ZenohLink:
+    """Topics of a domain by a router."""
+
+    def __init__(self, connect: Iterable[str], domain: int) -> None:
+        self.session = open_session(connect)
+        self.domain = domain
+        self._subscriptions: tuple[Any, ...] = ()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.session.close()
+
+    def definition_of(self, type_name: str) -> str:
+        """Definition of a type."""
+        return definition_of(type_name)
+
+    def listen(self, received: Callable[[Message], None], is_wanted: Callable[[str, str], bool]) -> None:
+        """Begin to give messages of the topics that are wanted, by name and type, to a function of zenoh's thread."""
+        self._subscriptions = subscribe(self.session, self.domain, received, is_wanted)
+
+    def stop(self) -> None:
+        """End that."""
+        for one in self._subscriptions:
+            one.undeclare()

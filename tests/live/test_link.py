@@ -11,8 +11,9 @@ import pytest
 
 from sonar_graph import Sequence, read_log, write_log
 from sonar_graph.errors import LogError
-from sonar_graph.live import LiveOptions, LiveRun, open_outlets, open_session, subscribe
-from sonar_graph.live.outlets import DETECTED, TOPICS
+from sonar_graph.live import LiveOptions, LiveRun, Message, Publisher, open_link, open_session, subscribe
+from sonar_graph.live.foxglove_link import FoxgloveLink
+from sonar_graph.live.outlets import DETECTED, TOPICS, ZenohOutlet
 from sonar_graph.live.zenoh_link import definition_of, parse_key, topic_key, type_hash
 from sonar_graph.logs import PartialCalibration
 from sonar_graph.logs.live_record import LiveRecord
@@ -92,7 +93,7 @@ def test_strangers_feed_it_and_read_every_topic(tmp_path, mission, endpoint):
             with LiveRecord(tmp_path / "record.mcap") as record, ExitStack() as stack:
                 given = PartialCalibration(mission.calibration.model_dump(mode="json"), "of the mission")
                 options = LiveOptions("ekf-slam", lateness_s=1.0, calibration=given)
-                outlets = open_outlets(session, 0, None)
+                outlets = [ZenohOutlet(session, 0)]
                 run = stack.enter_context(LiveRun(record, definition_of, options, outlets, lambda _: None))
                 subscriptions = subscribe(session, 0, run.accept)
                 time.sleep(0.5)
@@ -126,3 +127,75 @@ def test_strangers_feed_it_and_read_every_topic(tmp_path, mission, endpoint):
     at_ns = last.header.stamp.sec * 10**9 + last.header.stamp.nanosec
     place, truth = last.pose.pose.position, mission.truth.at(np.array([at_ns]))
     assert np.linalg.norm(truth.positions[0] - [place.x, place.y, place.z]) < 0.1
+
+
+def test_a_foxglove_bridge_feeds_it_and_may_break_off(tmp_path, mission):
+    """The server of foxglove-sdk in place of a bridge, which ends in the middle and comes back."""
+    foxglove = pytest.importorskip("foxglove")
+    pytest.importorskip("websockets")
+    messages = messages_of(tmp_path / "log.mcap", np.random.default_rng(0), 0.0)
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    context = foxglove.Context()
+    channels = {}
+    for topic, kind in {message.topic: message.type_name for message in messages}.items():
+        schema = foxglove.Schema(name=kind, encoding="ros2msg", data=definition_of(kind).encode())
+        channels[topic] = foxglove.Channel(topic, schema=schema, message_encoding="cdr", context=context)
+    server = foxglove.start_server(host="127.0.0.1", port=port, context=context, message_backlog_size=100_000)
+    got: list[Message] = []
+    try:
+        with FoxgloveLink(f"ws://127.0.0.1:{port}") as link:
+            link.listen(got.append, lambda _, kind: "Imu" in kind or "Dvl" in kind)
+            time.sleep(0.5)
+            half = len(messages) // 2
+            for message in messages[:half]:
+                channels[message.topic].log(message.payload)
+            until(lambda: len(got) == sum(wanted(message) for message in messages[:half]))
+            server.stop()
+            server = foxglove.start_server(host="127.0.0.1", port=port, context=context, message_backlog_size=100_000)
+            until(lambda: link.breaks == 1)
+            time.sleep(2.0)
+            for message in messages[half:]:
+                channels[message.topic].log(message.payload)
+            until(lambda: len(got) == sum(wanted(message) for message in messages))
+            assert link.definition_of("sensor_msgs/msg/Imu") == definition_of("sensor_msgs/msg/Imu")
+    finally:
+        server.stop()
+    assert [m.payload for m in got] == [m.payload for m in messages if wanted(m)]
+    assert {m.type_name for m in got} == {"sensor_msgs/msg/Imu", "marine_acoustic_msgs/msg/Dvl"}
+
+
+def wanted(message):
+    return message.topic in ("/imu/data", "/dvl/data")
+
+
+def until(holds, longest_s=20.0):
+    last_s = time.monotonic() + longest_s
+    while not holds() and time.monotonic() < last_s:
+        time.sleep(0.01)
+    assert holds()
+
+
+def test_a_bridge_that_is_not_there_is_named():
+    pytest.importorskip("websockets")
+    with pytest.raises(LogError, match=r"ws://127\.0\.0\.1:1: cannot connect"):
+        open_link(["ws://127.0.0.1:1"], 0)
+
+
+def test_a_router_that_ends_and_comes_back_is_heard_again(endpoint):
+    got = []
+    router = open_session(listen=[endpoint])
+    with open_session([endpoint]) as session:
+        subscriptions = subscribe(session, 0, got.append)
+        for round_number in (1, 2):
+            publisher = Publisher(router, 0, "/imu/data", "sensor_msgs/msg/Imu")
+            last_s = time.monotonic() + 20.0
+            while len({m.sender for m in got}) < round_number and time.monotonic() < last_s:
+                publisher.put(b"row")
+                time.sleep(0.05)
+            router.close()
+            router = open_session(listen=[endpoint])
+        assert len({m.sender for m in got}) == 2
+        assert subscriptions
+    router.close()
