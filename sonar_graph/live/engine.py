@@ -23,7 +23,6 @@ from sonar_graph.logs import (
     LATENESS,
     LIVE_RATE,
     Assembly,
-    Choice,
     LiveRecord,
     PartialCalibration,
     choose_each,
@@ -140,7 +139,7 @@ class Engine:
         if dropped == OVERLOADED:  # all other reasons are found again
             self.drop(name, log_time_ns, OVERLOADED, message.arrival_ns)
             return []
-        if is_new and self._reader is not None and self._brings_a_sensor():
+        if is_new and self._reader is not None and self._brings_a_sensor(message):
             self._begin_anew()
         elif self._reader is not None:
             return self._parts(message, log_time_ns)
@@ -178,12 +177,19 @@ class Engine:
         self.topics[message.topic] = topic
         self._record.add_topic(topic)
 
-    def _choices(self) -> dict[str, Choice]:
-        return choose_each(Recording(self.record_path, self.topics), self._wanted, self._config)
+    def _brings_a_sensor(self, message: Message) -> bool:
+        """Tell whether the first message of a topic is of a sensor that had none, such as the first detections."""
+        topics = {message.topic: self._gathered([(message, message.arrival_ns)])[message.topic]}
+        choices = choose_each(Recording(self.record_path, topics), self._wanted, self._config)
+        return any(c.topic is not None for role, c in choices.items() if role in BLOCKS.keys() - self.in_use)
 
-    def _brings_a_sensor(self) -> bool:
-        """Tell whether a topic that has just come is of a sensor that had none, such as the first detections."""
-        return any(c.topic is not None for role, c in self._choices().items() if role in BLOCKS.keys() - self.in_use)
+    def _gathered(self, held: list[tuple[Message, int]]) -> dict[str, Topic]:
+        """Topics with some messages and their log times."""
+        topics = {name: topic.empty() for name, topic in self.topics.items()}
+        for message, log_time_ns in held:
+            size = np.array([len(message.payload)])
+            topics[message.topic].gather(message.payload, np.zeros(1, np.int64), size, np.array([log_time_ns]))
+        return topics
 
     def _begin_anew(self) -> None:
         """Give all steps again from the record, with a sensor whose topic came late.
@@ -200,23 +206,20 @@ class Engine:
     def _is_set_up(self, message: Message) -> bool:
         """Try to choose topics and calibration; True once that is done."""
         if self._first_motion_ns is None:
-            choices = self._choices()
+            choices = choose_each(Recording(self.record_path, self.topics), self._wanted, self._config)
             has_both = all(choices[role].topic or choices[role].candidates for role in ("imu", "dvl"))
             self._first_motion_ns = message.arrival_ns if has_both else None
         if self._first_motion_ns is None or message.arrival_ns < self._first_motion_ns + SETUP_NS:
             return False
-        topics = {name: topic.empty() for name, topic in self.topics.items()}
-        for held, log_time_ns in self._first:
-            size = np.array([len(held.payload)])
-            topics[held.topic].gather(held.payload, np.zeros(1, np.int64), size, np.array([log_time_ns]))
-        recording = Recording(self.record_path, topics)
+        recording = Recording(self.record_path, self._gathered(self._first))
         choices = choose_topics(recording, self._wanted, self._config)
         assembly = Assembly(recording, choices, self._given)
         sequence = assembly.sequence("live")
         self.sequence, self.calibration, self.notes = sequence, sequence.calibration, sequence.notes
         self._record.describe(self.record_path.stem, self.calibration, pinned(self._config, choices), self._said)
         self._reader = MessageReader(assembly)
-        self.in_use = {role for role, choice in choices.items() if choice.topic is not None}
+        self._wanted = {role: choice.topic for role, choice in choices.items() if choice.topic is not None}
+        self.in_use = set(self._wanted)
         return True
 
     def _parts(self, message: Message, log_time_ns: int) -> list[Part]:

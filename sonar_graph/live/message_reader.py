@@ -56,17 +56,17 @@ class MessageReader:
             topic = self._topics[name].empty()
             topic.gather(payload, ONE, np.array([len(payload)]), np.array([log_time_ns]))
             try:
-                parts.append(self._part(role, topic))
+                parts.append(self._part(role, topic, log_time_ns))
             except LogError as error:
-                parts.append(Part(role, log_time_ns, None, str(error)))
+                parts.append(Part(role, log_time_ns, None, ", ".join(topic.unsound) or str(error)))
         return parts
 
-    def _part(self, role: str, topic: Topic) -> Part:
+    def _part(self, role: str, topic: Topic, log_time_ns: int) -> Part:
         adapter = self._adapters[role]
         if not adapter.reads_table:
             groups = topic.messages()
             block, dropped = rows_of(adapter, topic, self.calibration, *self._axes_and_origin[role])
-            stamp_ns = int(header_stamps_ns(groups[0], topic.log_times_ns)[0]) if groups else int(topic.log_times_ns[0])
+            stamp_ns = int(header_stamps_ns(groups[0], topic.log_times_ns)[0]) if groups else log_time_ns
             return Part(role, stamp_ns, block, ", ".join(topic.unsound | dropped))
         table = adapter.table(topic)
         block, dropped = rows_of(adapter, table, self.calibration, *self._axes_and_origin[role])

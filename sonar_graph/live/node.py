@@ -122,6 +122,7 @@ class LiveRun:
         self._record, self._options, self._outlets, self._said = record, options, outlets, said
         self._types = wanted_types(options.config or LogConfig(), ROLES)
         self._unused: set[str] = set()
+        self._faulty: set[str] = set()
         self._forms = PoseForms()
         self._answers: deque[Answer] = deque()
         warm_up = simulate_mission(MissionOptions(duration_s=WARM_UP_S))
@@ -247,6 +248,13 @@ class LiveRun:
                 raise
             self._unused.add(message.topic)
             self._said(f"not used: {error}")
+            return
+        except Exception as error:  # one message must not end a dive
+            fault = f"not used: {type(error).__name__}: {error}"
+            if message.topic not in self._faulty:
+                self._faulty.add(message.topic)
+                self._said(f"a message of {message.topic} {fault}; all are still recorded")
+            self.engine.drop(message.topic, self.engine.log_time_ns, fault, message.arrival_ns)
             return
         if self.engine.calibration is not None and self._generation != self.engine.generation:
             self._begin()

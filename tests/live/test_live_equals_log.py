@@ -18,9 +18,11 @@ NS = 1_000_000_000
 def live(path: Path, messages: list[Message], rate_hz: float = 10.0, lateness_s: float = 0.25):
     with LiveRecord(path) as record:
         engine = Engine(record, definition_of, rate_hz=rate_hz, lateness_s=lateness_s)
-        steps = []
+        steps, generation = [], 0
         for message in messages:
             engine.take(message)
+            if engine.generation != generation:
+                generation, steps = engine.generation, []
             steps += engine.steps()
         steps += engine.finish()
     return engine, steps
@@ -125,15 +127,8 @@ def test_a_sensor_whose_first_message_comes_late_is_in_all_steps(tmp_path):
         for message in messages_of(tmp_path / "log.mcap", np.random.default_rng(5), 0.4)
         if message.topic != "/sonar/landmarks" or message.arrival_ns > late_ns
     ]
-    with LiveRecord(tmp_path / "record.mcap") as record:
-        engine, generation, steps = Engine(record, definition_of), 0, []
-        for message in messages:
-            engine.take(message)
-            if engine.generation != generation:
-                generation, steps = engine.generation, []
-            steps += engine.steps()
-        steps += engine.finish()
-    assert generation == 1
+    engine, steps = live(tmp_path / "record.mcap", messages)
+    assert engine.generation == 1
     replayed = read_log(tmp_path / "record.mcap")
     assert replayed.detections.stamps_ns[0] > late_ns - NS
     assert replayed.calibration == engine.calibration
@@ -143,3 +138,56 @@ def test_a_sensor_whose_first_message_comes_late_is_in_all_steps(tmp_path):
     for mine, theirs in zip(steps, replayed.replay(replayed.instants(10.0)), strict=True):
         for name in ("imu", "dvl", "depth", "detections"):
             same_blocks(getattr(mine, name), getattr(theirs, name))
+
+
+def damaged(message: Message, noise: np.random.Generator) -> Message:
+    """A message that is cut, empty, of random bytes, or without a stamp."""
+    payload, kind = message.payload, noise.integers(4)
+    if kind == 0:
+        payload = payload[: noise.integers(1, len(payload))]
+    elif kind == 1:
+        payload = bytes(noise.integers(0, 256, len(payload), dtype=np.uint8))
+    elif kind == 2:
+        payload = b""
+    else:
+        payload = payload[:4] + bytes(8) + payload[12:]
+    return message._replace(payload=payload)
+
+
+@pytest.mark.parametrize("fault", ["damaged", "twice", "in any order"])
+@pytest.mark.parametrize("world", [small_world, aided_world])
+def test_whatever_arrives_a_record_gives_the_steps_that_were_live(tmp_path, world, fault):
+    noise = np.random.default_rng(7)
+    write_log(tmp_path / "log.mcap", world())
+    messages = messages_of(tmp_path / "log.mcap", noise, 0.1)
+    if fault == "damaged":
+        messages = [m if m.topic == "/tf_static" or noise.uniform() > 0.2 else damaged(m, noise) for m in messages]
+    elif fault == "twice":
+        messages = [again for m in messages for again in [m] * (1 + (noise.uniform() < 0.1))]
+    else:
+        order = np.argsort([m.arrival_ns + noise.uniform(0, 1e9) for m in messages])
+        times_ns = [m.arrival_ns for m in messages]
+        messages = [messages[i]._replace(arrival_ns=at_ns) for i, at_ns in zip(order, times_ns, strict=True)]
+    engine, steps = live(tmp_path / "record.mcap", messages)
+    assert engine.counts.dropped
+    record = read_log(tmp_path / "record.mcap")
+    replayed = list(record.replay(record.instants(10.0)))
+    assert len(steps) > 100
+    for mine, theirs in zip(steps, replayed, strict=True):
+        for name in record.blocks():
+            same_blocks(getattr(mine, name), getattr(theirs, name))
+
+
+def test_a_second_topic_of_a_sensor_that_comes_later_changes_nothing(tmp_path):
+    """Nor when detections come after it, so that all steps begin anew."""
+    write_log(tmp_path / "log.mcap", small_world())
+    messages = messages_of(tmp_path / "log.mcap", np.random.default_rng(5), 0.0)
+    middle = len(messages) // 2
+    first = [m for m in messages[:middle] if m.topic != "/sonar/landmarks"]
+    second_imu = next(m for m in first if m.topic == "/imu/data")._replace(topic="/imu/other")
+    later = second_imu._replace(arrival_ns=messages[middle].arrival_ns)
+    engine, _ = live(tmp_path / "record.mcap", [*first, later, *messages[middle:]])
+    assert engine.generation == 1
+    record = read_log(tmp_path / "record.mcap")
+    assert "imu: /imu/data" in record.notes["log.topics"]
+    assert record.detections is not None
