@@ -71,7 +71,9 @@ class ReadingOptions:
 
     calibration: Annotated[
         Path | None,
-        existing_file("TOML or JSON file whose fields go before those of the log's own calibration and mountings."),
+        existing_file(
+            "TOML or JSON file, or a log, whose fields go before those of the log's own calibration and mountings."
+        ),
     ] = None
     topics: Annotated[
         list[str] | None,

@@ -50,7 +50,8 @@ def live(
     log_config: Annotated[Path | None, typer.Option(exists=True, dir_okay=False, help="As for `run`.")] = None,
     calibration: Annotated[Path | None, typer.Option(exists=True, dir_okay=False, help="As for `run`.")] = None,
     foxglove: Annotated[
-        int | None, typer.Option(metavar="PORT", help="Also serve Foxglove and Lichtblick on 127.0.0.1 (8765).")
+        int | None,
+        typer.Option(metavar="PORT", min=1, max=65535, help="Also serve Foxglove and Lichtblick on 127.0.0.1 (8765)."),
     ] = None,
     resume: Annotated[
         Path | None,
@@ -93,12 +94,15 @@ def live(
                 echo(f"resumed from {resume}: blind for {(time.time_ns() - last_ns) * 1e-9:.1f} s")
             gc.freeze()  # what was loaded is never looked at again, which would delay a pose
             link.listen(run.accept, run.wants)
-            echo(f"listening to {', '.join(connect or [DEFAULT_ROUTER])}; the record is {record}")
+            echo(f"listening to {', '.join(connect or [DEFAULT_ROUTER])}, domain {domain}; the record is {record}")
             last_s = time.monotonic() + (float("inf") if duration is None else duration)
             while not ended.is_set() and time.monotonic() < last_s:
                 run.turn()
             link.stop()
             outcome = run.finish()
+    if not run.engine.topics:
+        record.unlink()
+        raise LogError(f"nothing was estimated: {run.lacking()}")
     if outcome is None:
         raise LogError(f"nothing was estimated: {run.lacking()}; what came is in {record}")
     counts = run.counts()

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from sonar_graph.calibration import Calibration
+from sonar_graph.errors import MissingTopicError
 from sonar_graph.live.arrivals import Arrivals
 from sonar_graph.live.live_messages import Message, dropped_messages, recorded_messages
 from sonar_graph.live.message_reader import MessageReader, Part
@@ -95,6 +96,8 @@ class Engine:
         """What the messages of these were."""
         self.log_time_ns = 0
         """Name of the newest message in the record."""
+        self.waits_for = ""
+        """What the first messages lack."""
         self.notes: dict[str, str] = {}
         """Notes of these, as `read_log` gives them."""
         self.record_path = record.path
@@ -212,7 +215,11 @@ class Engine:
         if self._first_motion_ns is None or message.arrival_ns < self._first_motion_ns + SETUP_NS:
             return False
         recording = Recording(self.record_path, self._gathered(self._first))
-        choices = choose_topics(recording, self._wanted, self._config)
+        try:
+            choices = choose_topics(recording, self._wanted, self._config)
+        except MissingTopicError as error:  # it may still come
+            self._first_motion_ns, self.waits_for = message.arrival_ns, str(error)
+            return False
         assembly = Assembly(recording, choices, self._given)
         sequence = assembly.sequence("live")
         self.sequence, self.calibration, self.notes = sequence, sequence.calibration, sequence.notes

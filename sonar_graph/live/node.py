@@ -15,6 +15,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from textwrap import shorten
 from typing import Any, Self
 
 import gtsam
@@ -46,6 +47,9 @@ from sonar_graph.states import Estimate
 
 FLUSH_S = 0.25
 STATE_S = 1.0
+LINE_WIDTH = 200
+WAITING_S = 5.0
+"""Time after which the user is told what is missing for an estimate."""
 MOST_WAITING_S = 2.0
 """Time of steps that may wait for the estimator before the oldest lose their detections."""
 
@@ -188,7 +192,9 @@ class LiveRun:
     def lacking(self) -> str:
         """What was missing for an estimate."""
         if not self.engine.topics:
-            return "no message came; is the domain right, and is a router running?"
+            return "no message came; is the domain right, and does anything send?"
+        if self.engine.waits_for:
+            return self.engine.waits_for
         came = ", ".join(f"{name} ({topic.type_name})" for name, topic in self.engine.topics.items())
         return f"an estimate needs an IMU and a Doppler log; there came {came}"
 
@@ -205,6 +211,9 @@ class LiveRun:
             self._put(DETECTED, payload)
             self._take(Message(DETECTED, TOPICS[DETECTED], payload, time.time_ns()))
         now_s = time.monotonic()
+        if self._predictor is None and now_s > self._stated_s + WAITING_S:
+            self._said(f"waiting: {self.lacking()}")
+            self._stated_s = now_s
         if now_s > self._flushed_s + FLUSH_S:
             self._record.flush()
             self._flushed_s = now_s
@@ -274,9 +283,11 @@ class LiveRun:
         assert self.engine.calibration is not None
         options, calibration = self._options, self.engine.calibration
         self._generation = self.engine.generation
+        if self._generation:
+            self._said("a further sensor has come: estimating anew from the beginning of the record")
         for subject in ("log.topics", "log.calibration", "log.start"):
             if subject in self.engine.notes:
-                self._said(f"{subject.removeprefix('log.')}: {self.engine.notes[subject]}")
+                self._said(shorten(f"{subject.removeprefix('log.')}: {self.engine.notes[subject]}", LINE_WIDTH))
         for warning in self.engine.notes.get("log.warnings", "").split("; "):
             if warning and not warning.startswith("detections:"):  # the odometry after the newest has not come yet
                 self._said(f"warning: {warning}")

@@ -95,8 +95,12 @@ def open_session(connect: Iterable[str] = (), listen: Iterable[str] = ()) -> Any
         "scouting/multicast/enabled": False,  # no other machine is looked for
         "scouting/gossip/enabled": False,
     }
-    for key, value in settings.items():
-        config.insert_json5(key, json.dumps(value))
+    try:
+        for key, value in settings.items():
+            config.insert_json5(key, json.dumps(value))
+    except zenoh.ZError as error:
+        where = ", ".join([*connect, *listen])
+        raise LogError(f"{where}: no endpoint of zenoh; expected one such as {DEFAULT_ROUTER}") from error
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:

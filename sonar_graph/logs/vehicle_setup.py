@@ -150,10 +150,15 @@ class PartialCalibration:
 
     @classmethod
     def read(cls, path: Path) -> PartialCalibration:
-        """Read a TOML or JSON file (by its suffix) whose fields go before the log's own.
+        """Read a TOML or JSON file (by its suffix), or the calibration of a log, whose fields go before the log's own.
 
         A file that cannot be read, is neither, or has a field that does not fit is a CalibrationError.
         """
+        if path.suffix == ".mcap":
+            recorded = read_calibration(scan(path, lambda _: Keep.NONE))
+            if recorded is None:
+                raise CalibrationError(f"{path}: the log has no calibration; give one that was written by sonar-graph")
+            return cls(recorded.model_dump(mode="json", exclude_unset=True), str(path))
         kind = "JSON" if path.suffix == ".json" else "TOML"
         try:
             text = text_of(path)

@@ -43,6 +43,14 @@ def test_a_router_that_is_not_there_is_named_before_anything_is_written(tmp_path
     assert not (tmp_path / "dive").exists()
 
 
+@pytest.mark.parametrize("where", ["127.0.0.1", "7447"])
+def test_an_endpoint_that_is_none_is_named(tmp_path, capsys, where):
+    code, line = said(capsys, "live", "-o", tmp_path / "dive", "--connect", where)
+    assert code == 2
+    assert line.count("\n") == 1
+    assert f"{where}: no endpoint of zenoh" in line
+
+
 def test_an_estimator_that_does_not_exist_is_refused_at_once(tmp_path, capsys):
     code, line = said(capsys, "live", "-o", tmp_path / "dive", "--estimator", "isam3")
     assert code == 2

@@ -191,3 +191,19 @@ def test_a_second_topic_of_a_sensor_that_comes_later_changes_nothing(tmp_path):
     record = read_log(tmp_path / "record.mcap")
     assert "imu: /imu/data" in record.notes["log.topics"]
     assert record.detections is not None
+
+
+def test_a_topic_that_was_chosen_may_come_late(tmp_path):
+    write_log(tmp_path / "log.mcap", small_world())
+    messages = messages_of(tmp_path / "log.mcap", np.random.default_rng(5), 0.0)
+    late_ns = messages[0].arrival_ns + 5 * NS
+    with LiveRecord(tmp_path / "record.mcap") as record:
+        engine = Engine(record, definition_of, wanted={"detections": "/sonar/landmarks"})
+        for message in messages:
+            if message.topic != "/sonar/landmarks" or message.arrival_ns > late_ns:
+                engine.take(message)
+            if message.arrival_ns < late_ns - NS:
+                assert engine.calibration is None
+        assert engine.calibration is not None
+        assert "/sonar/landmarks" in engine.waits_for
+        assert sum(1 for _ in engine.steps()) > 100
