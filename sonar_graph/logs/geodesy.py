@@ -34,4 +34,7 @@ def east_north_up(latitude_rad: Floats, longitude_rad: Floats, height_m: Floats,
     centre = earth_centred(*(np.array([value]) for value in origin))
     east, north = [-sin_lon, cos_lon, 0.0], [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat]
     enu_R_earth = np.array([east, north, [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat]])
-    return np.asarray((earth_centred(latitude_rad, longitude_rad, height_m) - centre) @ enu_R_earth.T)
+    from_centre = earth_centred(latitude_rad, longitude_rad, height_m) - centre
+    return np.asarray(
+        (enu_R_earth @ from_centre[:, :, None])[:, :, 0]
+    )  # row by row: a message alone gives the same bits

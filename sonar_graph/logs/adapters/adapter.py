@@ -36,7 +36,12 @@ def axes_matrix(rotation: Rotation) -> Floats:
 
 def turn(rotation: Rotation, vectors: Floats) -> Floats:
     """Vectors along the axes of this package, shape (n, 3); those that need no rotation keep every bit."""
-    return vectors if rotation == "flu" else vectors @ axes_matrix(rotation).T
+    return vectors if rotation == "flu" else turned(axes_matrix(rotation), vectors)
+
+
+def turned(R: Floats, vectors: Floats) -> Floats:
+    """Product of a matrix with each vector, shape (n, 3), whose bits do not depend on the other vectors."""
+    return np.asarray((R @ vectors[:, :, None])[:, :, 0])
 
 
 def turn_covariances(rotation: Rotation, covariances: Floats) -> Floats:
