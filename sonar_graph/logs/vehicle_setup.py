@@ -155,7 +155,10 @@ class PartialCalibration:
         A file that cannot be read, is neither, or has a field that does not fit is a CalibrationError.
         """
         if path.suffix == ".mcap":
-            recorded = read_calibration(scan(path, lambda _: Keep.NONE))
+            try:
+                recorded = read_calibration(scan(path, lambda _: Keep.NONE))
+            except LogError as error:
+                raise CalibrationError(str(error)) from error
             if recorded is None:
                 raise CalibrationError(f"{path}: the log has no calibration; give one that was written by sonar-graph")
             return cls(recorded.model_dump(mode="json", exclude_unset=True), str(path))
