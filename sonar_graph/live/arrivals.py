@@ -10,7 +10,7 @@ at or after t_k + L, with the lateness budget L. A message stamped at or before 
 late. It is refused by name, so that a log without the refused messages gives the same steps, to the bit.
 
 Time of arrival has one use: a stamp that runs ahead of its time of arrival is of a clock that was set, and would make
-all other sensors late.
+all other sensors late. A jump of half a day is never believed: it would be millions of steps.
 """
 
 from __future__ import annotations
@@ -26,12 +26,17 @@ from sonar_graph.measurements import BLOCKS, NS_PER_S, PAUSE_NS, Block, Measurem
 LATE = "late: its step was complete"
 REPEATED = "with the stamp of another"
 AHEAD = "stamped ahead of its arrival: a clock was set?"
+BEHIND = "stamped long before the others: a clock was set?"
 MOTION = ("imu", "dvl")
 """Sensors without which there is no estimate."""
 AHEAD_NS = NS_PER_S
 """Time by which a stamp may run ahead of its arrival, compared with the newest message before."""
 NEW_CLOCK_NS = 2 * NS_PER_S
 """Time of arrival after which stamps ahead are believed, where no other was."""
+FARTHEST_NS = PAUSE_NS // 2
+"""Jump that is not believed: a log that pauses for a day is two."""
+PADDING = {"candidate_ids": -1, "id_probability": 0}
+"""Columns of detections that are as wide as a message has candidates, and what stands for none."""
 MOST_PARTS = 256
 """Number of waiting blocks of a sensor that are made one."""
 
@@ -79,7 +84,12 @@ class Arrivals:
         self._first_ns: dict[str, int] = {}
         self._waiting: dict[str, list[Block]] = {name: [] for name in BLOCKS}
         self._stamps_ns: dict[str, set[int]] = {name: set() for name in BLOCKS}
-        self._last_arrival_ns: int | None = None
+        self._clock_ns: tuple[int, int] | None = None
+        """Newest stamp, and the arrival of the last message."""
+
+    def expect(self, stamp_ns: int, arrival_ns: int) -> None:
+        """Say what stamp is usual at a time of arrival, before the first message, whose own may be wrong."""
+        self._clock_ns = stamp_ns, arrival_ns
 
     def add(self, sensor: str, stamp_ns: int, block: Block | None, arrival_ns: int | None = None) -> str | None:
         """Take in a message of a sensor, by its name in `Measurements`; the reason why it is refused, or None.
@@ -87,10 +97,13 @@ class Arrivals:
         ``block``: its rows, all of this stamp; None of a sonar frame in which nothing was detected, which says that
         no detection up to its stamp will come.
         """
-        if arrival_ns is not None and self._last_arrival_ns is not None:
-            since_ns = max(arrival_ns - self._last_arrival_ns, 0)
-            if stamp_ns - max(self.newest_ns.values()) > since_ns + AHEAD_NS and since_ns < NEW_CLOCK_NS:
+        if arrival_ns is not None and self._clock_ns is not None:
+            newest_ns, last_arrival_ns = self._clock_ns
+            ahead_ns, since_ns = stamp_ns - newest_ns, max(arrival_ns - last_arrival_ns, 0)
+            if ahead_ns > FARTHEST_NS or (ahead_ns > since_ns + AHEAD_NS and since_ns < NEW_CLOCK_NS):
                 return AHEAD
+            if self.done_ns is None and ahead_ns < -FARTHEST_NS:
+                return BEHIND
         if self.done_ns is not None and stamp_ns <= self.done_ns:
             return LATE
         if block is not None:
@@ -102,7 +115,9 @@ class Arrivals:
                 self._waiting[sensor] = [joined(self._waiting[sensor])]
             self._first_ns[sensor] = min(stamp_ns, self._first_ns.get(sensor, stamp_ns))
         self.newest_ns[sensor] = max(stamp_ns, self.newest_ns.get(sensor, stamp_ns))
-        self._last_arrival_ns = arrival_ns
+        if arrival_ns is not None:
+            newest_ns = stamp_ns if self._clock_ns is None else max(stamp_ns, self._clock_ns[0])
+            self._clock_ns = newest_ns, arrival_ns
         return None
 
     @property
@@ -150,5 +165,15 @@ def joined(parts: list[Any]) -> Any:
         return parts[0]
     stamps_ns = np.concatenate([part.stamps_ns for part in parts])
     order = np.argsort(stamps_ns, kind="stable")
-    columns = {name: np.concatenate([getattr(part, name) for part in parts])[order] for name in vars(parts[0])}
+    columns = {name: _stacked(name, [getattr(part, name) for part in parts])[order] for name in vars(parts[0])}
     return type(parts[0])(**columns)
+
+
+def _stacked(name: str, columns: list[Any]) -> Any:
+    """Columns one below the other; candidates padded to the most with -1 and probability 0, as in a log."""
+    if name in PADDING:
+        most = max(column.shape[1] for column in columns)
+        columns = [
+            np.pad(column, ((0, 0), (0, most - column.shape[1])), constant_values=PADDING[name]) for column in columns
+        ]
+    return np.concatenate(columns)

@@ -8,6 +8,7 @@ a log that is played and a robot are the same.
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -16,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.errors import MissingTopicError
-from sonar_graph.live.arrivals import Arrivals
+from sonar_graph.errors import LogError, SonarGraphError
+from sonar_graph.live.arrivals import MOTION, Arrivals
 from sonar_graph.live.live_messages import Message, dropped_messages, recorded_messages
 from sonar_graph.live.message_reader import MessageReader, Part
 from sonar_graph.logs import (
@@ -29,6 +30,7 @@ from sonar_graph.logs import (
     choose_each,
     choose_topics,
     pinned,
+    rows_of,
 )
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.logs.mcap import Keep, Recording, Topic
@@ -37,6 +39,8 @@ from sonar_graph.sequence import Sequence
 
 OVERLOADED = "overload: the estimator was behind"
 SETUP_NS = 2 * NS_PER_S
+Held = list[tuple[Message, int]]
+"""Messages with their log times."""
 
 
 @dataclass
@@ -107,16 +111,24 @@ class Engine:
         self.generation = 0
         """Number of times that all steps began anew, since a topic of a further sensor came late."""
         self._rate_hz, self._lateness_s = rate_hz, lateness_s
-        self._said = {LIVE_RATE: f"{rate_hz:g}", LATENESS: f"{lateness_s:g}"}
+        self._said = {LIVE_RATE: repr(float(rate_hz)), LATENESS: repr(float(lateness_s))}
         self._wanted, self._config, self._given = dict(wanted or {}), config or LogConfig(), calibration
         self.topics: dict[str, Topic] = {}
         """Topics that have sent."""
-        self._first: list[tuple[Message, int]] = []
-        self._dropped: dict[tuple[str, int], str] = {}
-        """Messages that were dropped before all began anew."""
+        self.remarks: list[str] = []
+        """Lines for the user, who takes them away."""
+        self.waits_for = ""
+        """What the first messages lack."""
+        self._first: Held = []
         self._first_motion_ns: int | None = None
-        self.in_use: set[str] = set()
-        """Roles that have a topic."""
+        self._set_up_ns = 0
+        """Arrival of the message with which the set-up was tried last."""
+        self._in_use: dict[str, str] = {}
+        """Topics by role."""
+        self._places: dict[str, Choice] = {}
+        """Topics whose first rows make all begin anew."""
+        self._unfit: set[str] = set()
+        """Topics with which that failed."""
         self._reader: MessageReader | None = None
         self._sequence: dict[tuple[str, bytes], int] = {}
         self._detections: dict[int, list[tuple[str, int]]] = {}
@@ -136,23 +148,18 @@ class Engine:
             if place in self._sequence:
                 self.counts.lost[name] += max(message.sequence - self._sequence[place] - 1, 0)
             self._sequence[place] = max(message.sequence, self._sequence.get(place, 0))
-        log_time_ns = self.log_time_ns = self._record.write(
-            name, message.payload, message.arrival_ns, message.sequence, message.sent_ns
-        )
+        log_time_ns = self._record.write(name, message.payload, message.arrival_ns, message.sequence, message.sent_ns)
+        if is_new and self._reader is not None:
+            self._find_places()
         if dropped == OVERLOADED:  # all other reasons are found again
             self.drop(name, log_time_ns, OVERLOADED, message.arrival_ns)
             return []
-        if is_new and self._reader is not None and self._brings_a_sensor(message):
-            self._begin_anew()
-        elif self._reader is not None:
-            return self._parts(message, log_time_ns)
-        else:
+        if self._reader is None:
             self._first.append((message, log_time_ns))
-        if not self._is_set_up(message):
-            return []
-        held = [(m, ns) for m, ns in self._first if (m.topic, ns) not in self._dropped]
-        self._first.clear()
-        return [part for m, ns in held for part in self._parts(m, ns)]
+            return self._all_parts(self._first) if self._is_time(message) and self._set_up(self._first) else []
+        if name in self._places and self._brings_rows(message, log_time_ns) and (held := self._begin_anew(name)):
+            return self._all_parts(held)
+        return self._parts(message, log_time_ns, self._reader.read(name, message.payload, log_time_ns))
 
     def steps(self) -> Iterator[Measurements]:
         """Steps that are complete by now."""
@@ -180,61 +187,135 @@ class Engine:
         self.topics[message.topic] = topic
         self._record.add_topic(topic)
 
-    def _brings_a_sensor(self, message: Message) -> bool:
-        """Tell whether the first message of a topic is of a sensor that had none, such as the first detections."""
-        topics = {message.topic: self._gathered([(message, message.arrival_ns)])[message.topic]}
-        choices = choose_each(Recording(self.record_path, topics), self._wanted, self._config)
-        return any(c.topic is not None for role, c in choices.items() if role in BLOCKS.keys() - self.in_use)
+    def _find_places(self) -> None:
+        """Find topics that are not in use and may be of a sensor that has none, such as detections that begin late."""
+        choices = choose_each(Recording(self._record.path, self.topics), self._wanted, self._config)
+        self._places = {
+            choice.topic: choice
+            for role, choice in choices.items()
+            if role in BLOCKS.keys() - self._in_use.keys()
+            and choice.topic is not None
+            and choice.topic not in {*self._in_use.values(), *self._unfit}
+        }
 
-    def _gathered(self, held: list[tuple[Message, int]]) -> dict[str, Topic]:
-        """Topics with some messages and their log times."""
-        topics = {name: topic.empty() for name, topic in self.topics.items()}
-        for message, log_time_ns in held:
-            size = np.array([len(message.payload)])
-            topics[message.topic].gather(message.payload, np.zeros(1, np.int64), size, np.array([log_time_ns]))
-        return topics
+    def _brings_rows(self, message: Message, log_time_ns: int) -> bool:
+        """Tell whether a message has the first rows of its sensor; one that cannot be read is dropped."""
+        assert self.calibration is not None
+        choice = self._places[message.topic]
+        try:
+            block = _rows_in(choice, self.topics[message.topic], [(message, log_time_ns)], self.calibration)
+        except Exception as error:  # whatever a sender sends
+            self._drop(message.topic, log_time_ns, _unreadable(error), message.arrival_ns)
+            return False
+        return block is not None
 
-    def _begin_anew(self) -> None:
-        """Give all steps again from the record, with a sensor whose topic came late.
+    def _begin_anew(self, name: str) -> Held:
+        """Give all steps again from the record, with a sensor whose first rows came late; nothing where that fails.
 
         Its mounting is part of the calibration, which an estimator has from its beginning.
         """
         self._record.flush()
-        self._first = [(message, message.arrival_ns) for message in recorded_messages(self.record_path)]
-        self._dropped = dropped_messages(self.record_path)
-        self._arrivals, self._reader = Arrivals(self._rate_hz, self._lateness_s), None
+        dropped = dropped_messages(self._record.path)
+        messages = [(message, message.arrival_ns) for message in recorded_messages(self._record.path)]
+        held = [(message, at_ns) for message, at_ns in messages if (message.topic, at_ns) not in dropped]
+        if not self._set_up(held):
+            self._unfit.add(name)
+            self.remarks.append(f"{name} is not used: {self.waits_for}")
+            del self._places[name]
+            return []
         self._detections.clear()
         self.generation += 1
+        return held
 
-    def _is_set_up(self, message: Message) -> bool:
-        """Try to choose topics and calibration; True once that is done."""
+    def _is_time(self, message: Message) -> bool:
+        """Tell whether it is time to choose topics and calibration: some seconds of both sensors of the motion."""
         if self._first_motion_ns is None:
-            choices = choose_each(Recording(self.record_path, self.topics), self._wanted, self._config)
-            has_both = all(choices[role].topic or choices[role].candidates for role in ("imu", "dvl"))
-            self._first_motion_ns = message.arrival_ns if has_both else None
-        if self._first_motion_ns is None or message.arrival_ns < self._first_motion_ns + SETUP_NS:
+            choices = choose_each(Recording(self._record.path, self.topics), self._wanted, self._config)
+            if not all(choices[role].topic or choices[role].candidates for role in MOTION):
+                return False
+            self._first_motion_ns = self._set_up_ns = message.arrival_ns
+        since_ns = message.arrival_ns - self._set_up_ns
+        if since_ns < 0:  # this computer's clock was set
+            self._set_up_ns = message.arrival_ns
+        waited_ns = self._set_up_ns - self._first_motion_ns
+        if since_ns < max(SETUP_NS, waited_ns // 8):
             return False
-        recording = Recording(self.record_path, self._gathered(self._first))
-        try:
-            choices = choose_topics(recording, self._wanted, self._config)
-        except MissingTopicError as error:  # it may still come
-            self._first_motion_ns, self.waits_for = message.arrival_ns, str(error)
-            return False
-        assembly = Assembly(recording, choices, self._given)
-        sequence = assembly.sequence("live")
-        self.sequence, self.calibration, self.notes = sequence, sequence.calibration, sequence.notes
-        self._record.describe(self.record_path.stem, self.calibration, pinned(self._config, choices), self._said)
-        self._reader = MessageReader(assembly)
-        self._wanted = {role: choice.topic for role, choice in choices.items() if choice.topic is not None}
-        self.in_use = set(self._wanted)
+        self._set_up_ns = message.arrival_ns
         return True
 
-    def _parts(self, message: Message, log_time_ns: int) -> list[Part]:
+    def _set_up(self, held: Held) -> bool:
+        """Choose topics and gather the calibration from messages; False where they are not enough yet."""
+        wanted = self._wanted | self._in_use
+        recording = self._recording(held)
+        choices = choose_topics(recording, wanted, self._config)
+        if unreadable := self._unreadable_detections(choices["detections"], held):
+            held[:] = [one for one in held if one not in unreadable]
+            recording = self._recording(held)
+        try:
+            assembly = Assembly(recording, choices, self._given)
+            choices = {
+                role: choice if _is_of_use(assembly, role) else replace(choice, topic=None, adapter=None)
+                for role, choice in choices.items()
+            }
+            assembly = Assembly(recording, choices, self._given)
+            tables = pinned(self._config, choices, assembly)
+            config = LogConfig.parse(json.loads(json.dumps(tables)), self._config.source)
+            assembly = Assembly(recording, choose_topics(recording, {}, config), self._given)
+            sequence = assembly.sequence("live")
+            reader = MessageReader(assembly)
+        except SonarGraphError as error:
+            if str(error) != self.waits_for and self._reader is None:
+                self.remarks.append(f"waiting: {error}")
+            self.waits_for = str(error)
+            return False
+        self.waits_for = ""
+        frames_ns = max((at_ns for message, at_ns in held if message.topic.endswith("tf_static")), default=0)
+        self.calibration, self.notes, self._reader = sequence.calibration, sequence.notes, reader
+        self._record.describe(self._record.path.stem, self.calibration, tables, self._said, frames_ns)
+        self._arrivals = Arrivals(self._rate_hz, self._lateness_s)
+        self._in_use = {role: choice.topic for role, choice in choices.items() if choice.topic is not None}
+        self._find_places()
+        return True
+
+    def _recording(self, held: Held) -> Recording:
+        topics = {name: topic.empty() for name, topic in self.topics.items()}
+        for message, log_time_ns in held:
+            _gather(topics[message.topic], message, log_time_ns)
+        return Recording(self._record.path, topics)
+
+    def _unreadable_detections(self, choice: Choice, held: Held) -> Held:
+        """Messages of detections that break their own rules, which would make the topic useless; they are dropped."""
+        found: Held = []
+        for message, log_time_ns in held:
+            if message.topic == choice.topic:
+                try:
+                    _rows_in(choice, self.topics[message.topic], [(message, log_time_ns)], Calibration())
+                except Exception as error:  # whatever a sender sends
+                    found.append((message, log_time_ns))
+                    self._drop(message.topic, log_time_ns, _unreadable(error), message.arrival_ns)
+        return found
+
+    def _all_parts(self, held: Held) -> list[Part]:
+        """Parts of all messages until now, after the usual difference of their stamps from their arrival is known."""
         assert self._reader is not None
+        found = [(m, at_ns, self._reader.read(m.topic, m.payload, at_ns)) for m, at_ns in held]
+        first_ns = found[0][0].arrival_ns if found else 0
+        offsets_ns = sorted(
+            part.stamp_ns - message.arrival_ns
+            for message, _, parts in found
+            for part in parts
+            if not part.fault and message.arrival_ns < first_ns + SETUP_NS
+        )
+        if offsets_ns:
+            self._arrivals.expect(first_ns + offsets_ns[len(offsets_ns) // 2], first_ns)
+        self._first = []
+        return [part for m, at_ns, parts in found for part in self._parts(m, at_ns, parts)]
+
+    def _parts(self, message: Message, log_time_ns: int, found: list[Part]) -> list[Part]:
         parts, reasons = [], []
-        found = self._reader.read(message.topic, message.payload, log_time_ns)
         for part in found:
-            reason = part.fault or self._arrivals.add(part.role, part.stamp_ns, part.block, message.arrival_ns)
+            fault = part.fault if part.block is None else ""  # of some rows only: these are left out of a log too
+            reason = fault or self._arrivals.add(part.role, part.stamp_ns, part.block, message.arrival_ns)
             if reason:
                 reasons.append(reason)
                 continue
@@ -255,3 +336,35 @@ class Engine:
         """Name a message in the record as not used."""
         self.counts.dropped[topic, reason] += 1
         self._record.drop(topic, log_time_ns, reason, arrival_ns)
+
+
+def _gather(topic: Topic, message: Message, log_time_ns: int) -> None:
+    topic.gather(message.payload, np.zeros(1, np.int64), np.array([len(message.payload)]), np.array([log_time_ns]))
+
+
+def _rows_in(choice: Choice, topic: Topic, held: Held, calibration: Calibration) -> Any:
+    """Rows of some messages by themselves; None where they have none."""
+    topic = topic.empty()
+    for message, log_time_ns in held:
+        _gather(topic, message, log_time_ns)
+    adapter: Any = choice.adapter
+    source = adapter.table(topic) if adapter.reads_table else topic
+    block, _ = rows_of(adapter, source, calibration, np.eye(3), None)
+    if not topic.messages():
+        raise LogError(", ".join(topic.unsound))
+    return block
+
+
+def _is_of_use(assembly: Assembly, role: str) -> bool:
+    """Tell whether an optional sensor has sent what its calibration needs: a sound message, and a fix on the Earth."""
+    topic = assembly.topics.get(role)
+    if topic is None or role in MOTION or role not in BLOCKS:
+        return True
+    if not topic.messages():
+        return False
+    adapter = assembly.adapters[role]
+    return getattr(adapter, "geodetic", None) is None or assembly.axes_and_origin(role)[1] is not None
+
+
+def _unreadable(error: Exception) -> str:
+    return f"cannot be read: {str(error).rpartition(': topic ')[2] or type(error).__name__}"

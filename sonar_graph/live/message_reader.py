@@ -8,7 +8,8 @@ import numpy as np
 
 from sonar_graph.errors import LogError
 from sonar_graph.logs import Assembly, rows_of
-from sonar_graph.logs.adapters import header_stamps_ns
+from sonar_graph.logs.adapters import Adapter, field_of, header_stamps_ns
+from sonar_graph.logs.cdr import Messages
 from sonar_graph.logs.mcap import Topic
 from sonar_graph.measurements import BLOCKS, Ints
 
@@ -30,17 +31,12 @@ class MessageReader:
     """Reader of messages one by one.
 
     Topics, adapters, calibration, origin of the world and axes of a compass are those that the messages of the first
-    seconds gave (`Assembly`). What a whole log decides is decided by these: accelerations of zero are "not measured"
-    where they are in all of them.
+    seconds gave (`Assembly`, whose configuration is `pinned`).
     """
 
     def __init__(self, assembly: Assembly) -> None:
         self.calibration = assembly.calibration
-        imu = assembly.block("imu")
-        has_force = imu is not None and bool(np.isfinite(imu.specific_force).any())
-        self._adapters = assembly.adapters | {
-            "imu": assembly.adapters["imu"].model_copy(update={"are_zeros_measured": has_force})
-        }
+        self._adapters = assembly.adapters
         self._axes_and_origin = {role: assembly.axes_and_origin(role) for role in assembly.topics if role in BLOCKS}
         self._topics: dict[str, Topic] = {}
         self._roles: dict[str, list[str]] = {}
@@ -48,6 +44,11 @@ class MessageReader:
             topic = assembly.topics[role]
             self._topics[topic.name] = topic.empty()
             self._roles.setdefault(topic.name, []).append(role)
+        self._sizes = {
+            role: _sizes(self._adapters[role], assembly.topics[role].messages()[0])
+            for role in self._axes_and_origin
+            if self._adapters[role].reads_table
+        }
 
     def read(self, name: str, payload: bytes, log_time_ns: int) -> list[Part]:
         """What the message of a topic says, by role; nothing for a topic that is not used."""
@@ -56,9 +57,10 @@ class MessageReader:
             topic = self._topics[name].empty()
             topic.gather(payload, ONE, np.array([len(payload)]), np.array([log_time_ns]))
             try:
-                parts.append(self._part(role, topic, log_time_ns))
-            except LogError as error:
-                parts.append(Part(role, log_time_ns, None, ", ".join(topic.unsound) or str(error)))
+                parts.append(self._part(role, topic))
+            except Exception as error:  # whatever a sender sends
+                fault = str(error).removeprefix(f"{topic.file}: topic {name}: ")
+                parts.append(Part(role, log_time_ns, None, f"cannot be read: {fault or type(error).__name__}"))
         return parts
 
     def _part(self, role: str, topic: Topic, log_time_ns: int) -> Part:
@@ -66,8 +68,17 @@ class MessageReader:
         if not adapter.reads_table:
             groups = topic.messages()
             block, dropped = rows_of(adapter, topic, self.calibration, *self._axes_and_origin[role])
-            stamp_ns = int(header_stamps_ns(groups[0], topic.log_times_ns)[0]) if groups else log_time_ns
-            return Part(role, stamp_ns, block, ", ".join(topic.unsound | dropped))
+            faults = ", ".join(topic.unsound | dropped)
+            if not groups:
+                raise LogError(faults)
+            return Part(role, int(header_stamps_ns(groups[0], topic.log_times_ns)[0]), block, faults)
         table = adapter.table(topic)
+        if _sizes(adapter, table.groups[0]) != self._sizes[role]:
+            raise LogError("has arrays of another length than the first messages")
         block, dropped = rows_of(adapter, table, self.calibration, *self._axes_and_origin[role])
         return Part(role, int(table.stamps_ns[0]), block, ", ".join(topic.unsound | dropped))
+
+
+def _sizes(adapter: Adapter, group: Messages) -> list[tuple[int, ...]]:
+    """Number of elements of each field that an adapter reads."""
+    return [group[field_of(path)[0]].shape[1:] for path in adapter.fields()]

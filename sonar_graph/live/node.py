@@ -25,17 +25,8 @@ from sonar_graph.errors import EstimatorError, LogError
 from sonar_graph.live.engine import Engine, LiveOptions
 from sonar_graph.live.live_images import LiveImages
 from sonar_graph.live.live_messages import Message
-from sonar_graph.live.outlets import (
-    DETECTED,
-    OWN,
-    TOPICS,
-    Outlet,
-    PoseForms,
-    payload_of_detections,
-    payload_of_pose,
-    payload_of_state,
-    payloads_of_map,
-)
+from sonar_graph.live.message_reader import Part
+from sonar_graph.live.outlets import OWN, Outlet, PoseForms, payload_of_pose, payload_of_state, payloads_of_map
 from sonar_graph.live.predictor import Predictor
 from sonar_graph.live.worker import Answer, LiveOutcome, Worker
 from sonar_graph.logs import ROLES, LiveRecord, wanted_types
@@ -191,6 +182,8 @@ class LiveRun:
 
     def lacking(self) -> str:
         """What was missing for an estimate."""
+        if self.engine.waits_for:
+            return self.engine.waits_for
         if not self.engine.topics:
             return "no message came; is the domain right, and does anything send?"
         if self.engine.waits_for:
@@ -258,26 +251,37 @@ class LiveRun:
             self._unused.add(message.topic)
             self._said(f"not used: {error}")
             return
-        except Exception as error:  # one message must not end a dive
-            fault = f"not used: {type(error).__name__}: {error}"
-            if message.topic not in self._faulty:
-                self._faulty.add(message.topic)
-                self._said(f"a message of {message.topic} {fault}; all are still recorded")
-            self.engine.drop(message.topic, self.engine.log_time_ns, fault, message.arrival_ns)
+        except OSError:
+            raise  # the record cannot be written
+        except Exception as error:  # whatever a sender sends: it is in the record
+            self._fault(message.topic, error)
             return
+        for remark in self.engine.remarks:
+            self._said(remark)
+        self.engine.remarks.clear()
         if self.engine.calibration is not None and self._generation != self.engine.generation:
             self._begin()
-        if not self._is_quiet:
-            self._images.take(message, parts)
+        try:
+            self._move_on(parts, message.arrival_ns)
+        except Exception as error:  # only the pose at the rate of the IMU suffers
+            self._fault("the prediction", error)
+        for step in self.engine.steps():
+            self._worker.add(step)
+
+    def _move_on(self, parts: list[Part], arrival_ns: int) -> None:
         for part in parts:
             if self._predictor is None or part.role not in ("imu", "dvl") or part.block is None:
                 continue
             is_imu = part.role == "imu"
             self._predictor.add(part.block if is_imu else None, None if is_imu else part.block)
             if is_imu and part is parts[-1] and not self._is_quiet:
-                self._predict(message.arrival_ns)
-        for step in self.engine.steps():
-            self._worker.add(step)
+                self._predict(arrival_ns)
+
+    def _fault(self, what: str, error: Exception) -> None:
+        """Say once what went wrong with a topic, and go on."""
+        if what not in self._faulty:
+            self._faulty.add(what)
+            self._said(f"{what}: {type(error).__name__}: {error}; everything is still recorded")
 
     def _begin(self) -> None:
         assert self.engine.calibration is not None

@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from mcap.writer import Writer
@@ -22,13 +22,18 @@ from sonar_graph.errors import LogError
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.logs.cdr import Value, definition, encode, parse_definition, short_name
 from sonar_graph.logs.mcap import LIBRARY, ROSBAG2_METADATA, TRANSIENT_LOCAL, Keep, Recording, Topic, seal
-from sonar_graph.logs.roles import DROPPED, Choice
-from sonar_graph.logs.vehicle_setup import METADATA
+from sonar_graph.logs.roles import DROPPED, TF, Choice
+from sonar_graph.logs.vehicle_setup import METADATA, read_notes
+
+if TYPE_CHECKING:
+    from sonar_graph.logs.reading import Assembly
 
 DROPPED_TOPIC = "/sonar_graph/dropped"
 CHUNK_BYTES = 1 << 20
 LIVE_RATE, LATENESS = "live.rate_hz", "live.lateness_s"
 """Notes that say how often the live estimator was asked, and its lateness budget."""
+NEWEST_FRAMES = "live.newest_frames_ns"
+"""Note with the log time of the newest transforms that the calibration was gathered from; later ones did not count."""
 
 
 def dropped_in(recording: Recording) -> dict[tuple[str, int], str]:
@@ -44,8 +49,12 @@ def dropped_in(recording: Recording) -> dict[tuple[str, int], str]:
 
 
 def leave_out_dropped(recording: Recording) -> dict[str, str]:
-    """Remove these messages; a note that counts them."""
+    """Remove these messages, and transforms that came after the calibration was gathered; a note that counts them."""
     dropped = dropped_in(recording)
+    newest_ns = read_notes(recording).get(NEWEST_FRAMES, "")
+    for topic in recording.topics.values():
+        if newest_ns.isdecimal() and topic.name.endswith("tf_static") and short_name(topic.type_name) == short_name(TF):
+            topic.leave_out(topic.log_times_ns[topic.log_times_ns > int(newest_ns)])
     for name in {name for name, _ in dropped}:
         if name in recording.topics:
             times_ns = [log_time_ns for topic, log_time_ns in dropped if topic == name]
@@ -67,14 +76,28 @@ def recorded_config(recording: Recording) -> LogConfig | None:
         raise LogError(f"{source} is no JSON object: {error}") from error
 
 
-def pinned(config: LogConfig, choices: Mapping[str, Choice]) -> dict[str, Any]:
-    """Tables of a configuration with which a log gets the same topics in the same roles."""
+def pinned(config: LogConfig, choices: Mapping[str, Choice], assembly: Assembly) -> dict[str, Any]:
+    """Tables of a configuration with which a log gets the same topics in the same roles, read in the same way.
+
+    What a log decides by all its messages is decided by those of an assembly: whether a driver fills the acceleration
+    and counts beams, and the origin of the world.
+    """
     tables: dict[str, Any] = {role: dict(table) for role, table in config.tables.items()}
     for role, choice in choices.items():
         if choice.topic is None:
             tables[role] = {"use": False}
         else:
             tables.setdefault(role, {})["topic"] = choice.topic
+    imu, dvl = assembly.block("imu"), assembly.adapters["dvl"]
+    has_force = imu is not None and bool(np.isfinite(imu.specific_force).any())
+    tables["imu"] |= {"are_zeros_measured": True} if has_force else {"unfilled": "each"}
+    if dvl.good_beams is not None:
+        are_counted = bool(dvl.table(assembly.topics["dvl"]).column(dvl.good_beams).any())
+        tables["dvl"] |= {"are_beams_counted": True} if are_counted else {"good_beams": False}
+    for role in ("positions", "truth"):
+        if role in assembly.topics and assembly.adapters[role].geodetic is not None:
+            _, origin = assembly.axes_and_origin(role)
+            tables[role]["geodetic"] = {**tables[role].get("geodetic", {}), "origin_deg_m": origin}
     return tables
 
 
@@ -107,14 +130,22 @@ class LiveRecord:
         self._stream.close()
 
     def describe(
-        self, name: str, calibration: Calibration, tables: Mapping[str, Any], notes: Mapping[str, str]
+        self,
+        name: str,
+        calibration: Calibration,
+        tables: Mapping[str, Any],
+        notes: Mapping[str, str],
+        newest_frames_ns: int,
     ) -> None:
-        """Write what counted: name, calibration with the start, configuration of the topics, and notes."""
+        """Write what counted: name, calibration with the start, configuration of the topics, and notes.
+
+        ``newest_frames_ns``: log time of the newest transforms that the calibration was gathered from.
+        """
         content = {
             "name": name,
             "calibration": calibration.model_dump_json(),
             "log_config": json.dumps(tables),
-            "notes": json.dumps(dict(notes)),
+            "notes": json.dumps({**notes, NEWEST_FRAMES: str(newest_frames_ns)}),
         }
         self._writer.add_metadata(METADATA, seal(content))
         self.flush()
@@ -137,7 +168,8 @@ class LiveRecord:
         """Write a message as it came; its log time, by which it is named: of arrival, and unlike any other's."""
         log_time_ns = max(arrival_ns, self._newest_ns.get(topic, 0) + 1)
         self._newest_ns[topic] = log_time_ns
-        self._writer.add_message(self._channels[topic], log_time_ns, payload, sent_ns or log_time_ns, sequence % 2**32)
+        sent_ns = sent_ns if 0 < sent_ns < 2**63 else log_time_ns
+        self._writer.add_message(self._channels[topic], log_time_ns, payload, sent_ns, sequence % 2**32)
         return log_time_ns
 
     def drop(self, topic: str, log_time_ns: int, reason: str, arrival_ns: int) -> None:

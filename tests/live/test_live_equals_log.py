@@ -15,15 +15,16 @@ from tests.live.traffic import messages_of
 NS = 1_000_000_000
 
 
-def live(path: Path, messages: list[Message], rate_hz: float = 10.0, lateness_s: float = 0.25):
+def live(path: Path, messages: list[Message], **options):
     with LiveRecord(path) as record:
-        engine = Engine(record, definition_of, rate_hz=rate_hz, lateness_s=lateness_s)
-        steps, generation = [], 0
+        engine, generation, steps = Engine(record, definition_of, **options), 0, []
         for message in messages:
             engine.take(message)
             if engine.generation != generation:
                 generation, steps = engine.generation, []
-            steps += engine.steps()
+            for step in engine.steps():
+                steps.append(step)
+                assert len(steps) < 1000, "steps without end"
         steps += engine.finish()
     return engine, steps
 

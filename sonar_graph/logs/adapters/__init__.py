@@ -11,7 +11,7 @@ from sonar_graph.logs.adapters.landmark_messages import (
 from sonar_graph.logs.adapters.log_config import (
     LogConfig, changes_text, plain_lines, read_log_config, shipped_for, shipped_like, table_text,
 )
-from sonar_graph.logs.adapters.message_table import Dropped, MessageTable, header_stamps_ns
+from sonar_graph.logs.adapters.message_table import Dropped, MessageTable, field_of, header_stamps_ns
 from sonar_graph.logs.adapters.sonar_messages import SAMPLE_TYPES, Refused, SonarAdapter
 from sonar_graph.logs.adapters.vehicle_messages import DepthAdapter, ImuAdapter, TruthAdapter, body_to_ros
 
@@ -19,6 +19,6 @@ __all__ = [
     "Adapter", "DepthAdapter", "DetectionArrayAdapter", "DetectionListsAdapter", "Dropped", "DvlAdapter",
     "HeadingAdapter", "ImuAdapter", "LandmarkMapAdapter", "LogConfig", "MessageTable", "PositionAdapter", "Refused",
     "SAMPLE_TYPES", "SHIPPED", "Shipped", "SonarAdapter", "TRUTH_WORDS", "TruthAdapter", "Z_DOWN_TYPES", "body_to_ros",
-    "changes_text", "detection_warnings", "header_stamps_ns", "leaf_fields", "plain_lines", "read_log_config",
-    "shipped_for", "shipped_like", "table_text",
+    "changes_text", "detection_warnings", "field_of", "header_stamps_ns", "leaf_fields", "plain_lines",
+    "read_log_config", "shipped_for", "shipped_like", "table_text",
 ]

@@ -135,6 +135,8 @@ class DvlAdapter(Adapter):
     """Fields, each with its value in messages to be used: {velocity_mode = 1}."""
     good_beams: str | None = None
     """Field that counts good beams; messages with none are left out, where the driver counts at all."""
+    are_beams_counted: bool = False
+    """true: the driver counts, so that messages with none are left out even where no message has any."""
     beams: BeamGeometry | None = None
     """Directions of the beams."""
     beam_unit_vectors: tuple[str, str, str] | None = None
@@ -179,7 +181,7 @@ class DvlAdapter(Adapter):
             faults[f"with {path} not {str(value).lower()}"] = table.column(path) != value
         if self.good_beams is not None:
             beams = table.column(self.good_beams)
-            faults["without a good beam"] = (beams == 0) & beams.any()
+            faults["without a good beam"] = (beams == 0) & (self.are_beams_counted or beams.any())
         faults[NOT_FINITE] = not_finite(velocity)
         rows, dropped = fit_rows(table.stamps_ns, faults, unique=True)
         velocity, covariance = turn(self.rotation, velocity[rows]), turn_covariances(self.rotation, covariance[rows])

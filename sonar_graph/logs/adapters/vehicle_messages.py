@@ -46,6 +46,8 @@ class ImuAdapter(Adapter):
     """Field that is -1 where it was not measured."""
     are_zeros_measured: bool = False
     """true: an acceleration of 0 is a value even where all messages have it; else the driver does not fill it."""
+    unfilled: Literal["all", "each"] = "all"
+    """"all": zeros are not measured where all messages have them; "each": wherever a message has them."""
 
     def fields(self) -> Iterator[str]:
         """Paths that a message must have."""
@@ -57,6 +59,8 @@ class ImuAdapter(Adapter):
         rate = _scaled(table.beside(self.angular_velocity), self.angular_velocity_scale)
         force = _scaled(table.beside(self.linear_acceleration), self.linear_acceleration_scale)
         unmeasured = _is_marked(table, self.linear_acceleration_status) | self._is_force_unfilled(table)
+        if self.unfilled == "each":
+            unmeasured |= ~force.any(axis=1)
         force = np.where(unmeasured[:, None] | ~(np.abs(force) < LARGEST), np.nan, force)
         faults = {"without angular rate": _is_marked(table, self.angular_velocity_status), NOT_FINITE: not_finite(rate)}
         rows, dropped = fit_rows(table.stamps_ns, faults, unique=True)
