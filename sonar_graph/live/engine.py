@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.errors import LogError, SonarGraphError
+from sonar_graph.errors import LogError, MissingTopicError, SonarGraphError
 from sonar_graph.live.arrivals import MOTION, Arrivals
 from sonar_graph.live.live_messages import Message, dropped_messages, recorded_messages
 from sonar_graph.live.message_reader import MessageReader, Part
@@ -25,6 +25,7 @@ from sonar_graph.logs import (
     LATENESS,
     LIVE_RATE,
     Assembly,
+    Choice,
     LiveRecord,
     PartialCalibration,
     choose_each,
@@ -100,8 +101,6 @@ class Engine:
         """What the messages of these were."""
         self.log_time_ns = 0
         """Name of the newest message in the record."""
-        self.waits_for = ""
-        """What the first messages lack."""
         self.notes: dict[str, str] = {}
         """Notes of these, as `read_log` gives them."""
         self.record_path = record.path
@@ -123,7 +122,7 @@ class Engine:
         self._first_motion_ns: int | None = None
         self._set_up_ns = 0
         """Arrival of the message with which the set-up was tried last."""
-        self._in_use: dict[str, str] = {}
+        self.in_use: dict[str, str] = {}
         """Topics by role."""
         self._places: dict[str, Choice] = {}
         """Topics whose first rows make all begin anew."""
@@ -148,7 +147,9 @@ class Engine:
             if place in self._sequence:
                 self.counts.lost[name] += max(message.sequence - self._sequence[place] - 1, 0)
             self._sequence[place] = max(message.sequence, self._sequence.get(place, 0))
-        log_time_ns = self._record.write(name, message.payload, message.arrival_ns, message.sequence, message.sent_ns)
+        log_time_ns = self.log_time_ns = self._record.write(
+            name, message.payload, message.arrival_ns, message.sequence, message.sent_ns
+        )
         if is_new and self._reader is not None:
             self._find_places()
         if dropped == OVERLOADED:  # all other reasons are found again
@@ -189,13 +190,13 @@ class Engine:
 
     def _find_places(self) -> None:
         """Find topics that are not in use and may be of a sensor that has none, such as detections that begin late."""
-        choices = choose_each(Recording(self._record.path, self.topics), self._wanted, self._config)
+        choices = choose_each(Recording(self.record_path, self.topics), self._wanted, self._config)
         self._places = {
             choice.topic: choice
             for role, choice in choices.items()
-            if role in BLOCKS.keys() - self._in_use.keys()
+            if role in BLOCKS.keys() - self.in_use.keys()
             and choice.topic is not None
-            and choice.topic not in {*self._in_use.values(), *self._unfit}
+            and choice.topic not in {*self.in_use.values(), *self._unfit}
         }
 
     def _brings_rows(self, message: Message, log_time_ns: int) -> bool:
@@ -205,7 +206,7 @@ class Engine:
         try:
             block = _rows_in(choice, self.topics[message.topic], [(message, log_time_ns)], self.calibration)
         except Exception as error:  # whatever a sender sends
-            self._drop(message.topic, log_time_ns, _unreadable(error), message.arrival_ns)
+            self.drop(message.topic, log_time_ns, _unreadable(error), message.arrival_ns)
             return False
         return block is not None
 
@@ -215,8 +216,8 @@ class Engine:
         Its mounting is part of the calibration, which an estimator has from its beginning.
         """
         self._record.flush()
-        dropped = dropped_messages(self._record.path)
-        messages = [(message, message.arrival_ns) for message in recorded_messages(self._record.path)]
+        dropped = dropped_messages(self.record_path)
+        messages = [(message, message.arrival_ns) for message in recorded_messages(self.record_path)]
         held = [(message, at_ns) for message, at_ns in messages if (message.topic, at_ns) not in dropped]
         if not self._set_up(held):
             self._unfit.add(name)
@@ -230,7 +231,7 @@ class Engine:
     def _is_time(self, message: Message) -> bool:
         """Tell whether it is time to choose topics and calibration: some seconds of both sensors of the motion."""
         if self._first_motion_ns is None:
-            choices = choose_each(Recording(self._record.path, self.topics), self._wanted, self._config)
+            choices = choose_each(Recording(self.record_path, self.topics), self._wanted, self._config)
             if not all(choices[role].topic or choices[role].candidates for role in MOTION):
                 return False
             self._first_motion_ns = self._set_up_ns = message.arrival_ns
@@ -245,9 +246,13 @@ class Engine:
 
     def _set_up(self, held: Held) -> bool:
         """Choose topics and gather the calibration from messages; False where they are not enough yet."""
-        wanted = self._wanted | self._in_use
+        wanted = self._wanted | self.in_use
         recording = self._recording(held)
-        choices = choose_topics(recording, wanted, self._config)
+        try:
+            choices = choose_topics(recording, wanted, self._config)
+        except MissingTopicError as error:  # it may still come
+            self.waits_for = str(error)
+            return False
         if unreadable := self._unreadable_detections(choices["detections"], held):
             held[:] = [one for one in held if one not in unreadable]
             recording = self._recording(held)
@@ -270,10 +275,11 @@ class Engine:
             return False
         self.waits_for = ""
         frames_ns = max((at_ns for message, at_ns in held if message.topic.endswith("tf_static")), default=0)
-        self.calibration, self.notes, self._reader = sequence.calibration, sequence.notes, reader
-        self._record.describe(self._record.path.stem, self.calibration, tables, self._said, frames_ns)
+        self.sequence, self.calibration, self.notes = sequence, sequence.calibration, sequence.notes
+        self._reader = reader
+        self._record.describe(self.record_path.stem, self.calibration, tables, self._said, frames_ns)
         self._arrivals = Arrivals(self._rate_hz, self._lateness_s)
-        self._in_use = {role: choice.topic for role, choice in choices.items() if choice.topic is not None}
+        self.in_use = {role: choice.topic for role, choice in choices.items() if choice.topic is not None}
         self._find_places()
         return True
 
@@ -281,7 +287,7 @@ class Engine:
         topics = {name: topic.empty() for name, topic in self.topics.items()}
         for message, log_time_ns in held:
             _gather(topics[message.topic], message, log_time_ns)
-        return Recording(self._record.path, topics)
+        return Recording(self.record_path, topics)
 
     def _unreadable_detections(self, choice: Choice, held: Held) -> Held:
         """Messages of detections that break their own rules, which would make the topic useless; they are dropped."""
@@ -292,7 +298,7 @@ class Engine:
                     _rows_in(choice, self.topics[message.topic], [(message, log_time_ns)], Calibration())
                 except Exception as error:  # whatever a sender sends
                     found.append((message, log_time_ns))
-                    self._drop(message.topic, log_time_ns, _unreadable(error), message.arrival_ns)
+                    self.drop(message.topic, log_time_ns, _unreadable(error), message.arrival_ns)
         return found
 
     def _all_parts(self, held: Held) -> list[Part]:

@@ -63,7 +63,7 @@ class MessageReader:
                 parts.append(Part(role, log_time_ns, None, f"cannot be read: {fault or type(error).__name__}"))
         return parts
 
-    def _part(self, role: str, topic: Topic, log_time_ns: int) -> Part:
+    def _part(self, role: str, topic: Topic) -> Part:
         adapter = self._adapters[role]
         if not adapter.reads_table:
             groups = topic.messages()

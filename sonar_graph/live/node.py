@@ -26,7 +26,17 @@ from sonar_graph.live.engine import Engine, LiveOptions
 from sonar_graph.live.live_images import LiveImages
 from sonar_graph.live.live_messages import Message
 from sonar_graph.live.message_reader import Part
-from sonar_graph.live.outlets import OWN, Outlet, PoseForms, payload_of_pose, payload_of_state, payloads_of_map
+from sonar_graph.live.outlets import (
+    DETECTED,
+    OWN,
+    TOPICS,
+    Outlet,
+    PoseForms,
+    payload_of_detections,
+    payload_of_pose,
+    payload_of_state,
+    payloads_of_map,
+)
 from sonar_graph.live.predictor import Predictor
 from sonar_graph.live.worker import Answer, LiveOutcome, Worker
 from sonar_graph.logs import ROLES, LiveRecord, wanted_types
@@ -186,8 +196,6 @@ class LiveRun:
             return self.engine.waits_for
         if not self.engine.topics:
             return "no message came; is the domain right, and does anything send?"
-        if self.engine.waits_for:
-            return self.engine.waits_for
         came = ", ".join(f"{name} ({topic.type_name})" for name, topic in self.engine.topics.items())
         return f"an estimate needs an IMU and a Doppler log; there came {came}"
 
@@ -261,6 +269,8 @@ class LiveRun:
         self.engine.remarks.clear()
         if self.engine.calibration is not None and self._generation != self.engine.generation:
             self._begin()
+        if not self._is_quiet:
+            self._images.take(message, parts)
         try:
             self._move_on(parts, message.arrival_ns)
         except Exception as error:  # only the pose at the rate of the IMU suffers
