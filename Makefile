@@ -2,15 +2,18 @@
 # make test    install, run the fast tests
 # make test-slow, make test-thorough   the slow tests; every property with many examples
 # make check   lint, format, types, import contracts
+# make bench-page   estimators and rules of others on recordings and basins, hours; SONAR_GRAPH_DATA=folder of recordings
+# make docs    the documentation as a site, in build/site: pages to open in a browser, without a network
 # PYTHON=python3.13 chooses the interpreter, VENV=folder the environment.
 
 PYTHON ?= python3
 VENV ?= .venv
 DEMO ?= demo
+BENCH ?= bench
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: demo test test-slow test-thorough check format wheel check-wheel install clean
+.PHONY: bench-page demo docs test test-slow test-thorough check format wheel check-wheel install clean
 
 demo: $(VENV)/.installed
 	$(BIN)/sonar-graph demo -o $(DEMO)
@@ -35,9 +38,19 @@ check: $(VENV)/.installed-lint
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+# A warning ends it: a dead link, a page that is in no menu, a tutorial or a docstring that fails.
+docs: $(VENV)/.installed-docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --config-file docs/site/mkdocs.yml
+	@echo "Open build/site/index.html"
+
 format: $(VENV)/.installed-lint
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+# All estimators, and rules of other projects, on recordings and basins: one page. Recordings: SONAR_GRAPH_DATA=folder.
+bench-page: $(VENV)/.installed
+	$(PIP) --editable '.[bench]' --editable benchmarks/published_rules
+	$(BIN)/sonar-graph bench benchmarks/suites/open.toml -o $(BENCH)
 
 wheel: $(BIN)/python
 	rm -rf dist
@@ -65,6 +78,10 @@ $(VENV)/.installed: pyproject.toml | $(BIN)/python
 
 $(VENV)/.installed-tests: pyproject.toml | $(BIN)/python
 	$(PIP) --editable '.[tests]'
+	@touch $@ $(VENV)/.installed
+
+$(VENV)/.installed-docs: pyproject.toml | $(BIN)/python
+	$(PIP) --editable '.[docs]'
 	@touch $@ $(VENV)/.installed
 
 $(VENV)/.installed-lint: pyproject.toml | $(BIN)/python

@@ -65,7 +65,7 @@ class SectionType(ModelMetaclass):
 class Section(BaseModel, metaclass=SectionType):
     """A frozen group of settings that refuses names it does not know."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Refuse to change a setting."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields
+from functools import cache
 from itertools import pairwise
 from typing import Any, Self
 
@@ -78,21 +79,19 @@ class Block:
         if stamps.ndim != 1:
             raise MeasurementError(f"{name}.stamps_ns: expected shape (n,), not {stamps.shape}")
         n = len(stamps)
-        for column in fields(self):
-            place = f"{name}.{column.name}"
-            values = _numbers(place, np.asarray(getattr(self, column.name)), is_whole=column.type == "Ints")
-            row_shape = column.metadata.get("shape", values.shape[1:])
+        for column, place, is_whole, shape, is_finite in _columns(type(self)):  # type: ignore[arg-type]  # hash of a row
+            values = _numbers(place, np.asarray(getattr(self, column)), is_whole=is_whole)
+            row_shape = values.shape[1:] if shape is None else shape
             if values.shape[:1] != (n,):
                 advice = "; transpose it" * (values.shape[1:] == (n,))
                 raise MeasurementError(f"{place}: shape {values.shape} has not one row for each of {n} stamps{advice}")
             if values.shape[1:] != row_shape:
                 raise MeasurementError(f"{place}: expected shape {(n, *row_shape)}, not {values.shape}")
-            if column.metadata.get("finite") and not np.isfinite(values).all():
+            if is_finite and not np.isfinite(values).all():
                 row = np.argwhere(~np.isfinite(values))[0, 0]
                 raise MeasurementError(f"{place}: row {row} is not finite; leave such rows out of the block")
-            object.__setattr__(self, column.name, values)
-        backwards = np.flatnonzero(self.stamps_ns[1:] < self.stamps_ns[:-1])
-        if backwards.size:
+            object.__setattr__(self, column, values)
+        if n > 1 and (backwards := np.flatnonzero(self.stamps_ns[1:] < self.stamps_ns[:-1])).size:
             raise MeasurementError(f"{name}: stamps run backwards after row {backwards[0]}; sort the rows by stamp")
 
     def __len__(self) -> int:
@@ -109,11 +108,15 @@ class Block:
     def rows(self, selection: slice | NDArray[np.bool_] | Ints) -> Self:
         """The block with only the selected rows."""
         if isinstance(selection, slice) and (selection.step or 1) > 0 and len(self.stamps_ns[selection]):
-            block = object.__new__(type(self))  # a run of rows of a valid block is valid
-            for name, column in vars(self).items():
-                object.__setattr__(block, name, column[selection])
-            return block
+            return self.of_valid(*(column[selection] for column in vars(self).values()))  # as the whole is
         return type(self)(*(getattr(self, column.name)[selection] for column in fields(self)))
+
+    @classmethod
+    def of_valid(cls, *columns: NDArray[Any]) -> Self:
+        """A block of columns that are known to keep the rules, which are not checked again."""
+        block = object.__new__(cls)
+        vars(block).update(zip(_names(cls), columns, strict=True))  # type: ignore[arg-type]  # hash of a row
+        return block
 
     def between(self, after_ns: int, until_ns: int) -> Self | None:
         """The rows with ``after_ns < stamp <= until_ns``, or None where there is none."""
@@ -124,6 +127,26 @@ class Block:
     def concatenate(cls, blocks: Sequence[Self]) -> Self:
         """One block from several, in the order given."""
         return cls(*(np.concatenate([getattr(b, column.name) for b in blocks]) for column in fields(cls)))
+
+
+@cache
+def _names(kind: type[Block]) -> list[str]:
+    return [column.name for column in fields(kind)]
+
+
+@cache
+def _columns(kind: type[Block]) -> list[tuple[str, str, bool, tuple[int, ...] | None, bool]]:
+    """Name, place in errors, and rules of each column: is it whole, the shape of a row, must it be finite."""
+    return [
+        (
+            column.name,
+            f"{kind.__name__}.{column.name}",
+            column.type == "Ints",
+            column.metadata.get("shape"),
+            bool(column.metadata.get("finite")),
+        )
+        for column in fields(kind)
+    ]
 
 
 def _numbers(place: str, values: NDArray[Any], *, is_whole: bool) -> NDArray[Any]:

@@ -85,7 +85,21 @@ def require_source(odometry: object, calibration: Calibration, call: str) -> Non
 
 
 class Motions(NamedTuple):
-    """Motions over n intervals, as arrays; all NaN for an interval that has a gap of the Doppler log."""
+    """Motions over n intervals, as arrays; all NaN for an interval that has a gap of the Doppler log.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sonar_graph import Odometry
+    >>> from sonar_graph.testing import small_world
+    >>> world = small_world()
+    >>> odometry = Odometry(world.calibration)
+    >>> is_out_of_date = odometry.add(world.imu, world.dvl)
+    >>> epochs = odometry.epochs(world.start_ns, world.end_ns)
+    >>> motions = odometry.motions(epochs[:3], epochs[1:4], np.full(3, world.end_ns), np.zeros(3))
+    >>> motions.dR.shape, motions.dp.shape, motions.C.shape
+    ((3, 3, 3), (3, 3), (3, 6, 6))
+    """
 
     dR: Floats
     """i_R_j, shape (n, 3, 3)."""
@@ -103,6 +117,12 @@ class MotionSource(Protocol):
     """Contract of the source of motion that is handed to an estimator, such as `sonar_graph.navigation.Odometry`.
 
     What a motion uses depends on stamps alone, not on how a log is cut into blocks.
+
+    Examples
+    --------
+    >>> from sonar_graph import Calibration, Odometry
+    >>> from sonar_graph.navigation import MotionSource
+    >>> source: MotionSource = Odometry(Calibration())
     """
 
     @property

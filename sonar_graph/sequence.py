@@ -27,6 +27,7 @@ from sonar_graph.measurements import (
 )
 from sonar_graph.measurements import PAUSE_NS as PAUSE_NS
 from sonar_graph.states import LandmarkMap, Refusal, RefusedRow, Trajectory
+from sonar_graph.table import ABSENT, as_html, text_table
 
 MOST_INSTANTS = 10_000_000
 """Two months at 2 Hz; a clock that was set meanwhile could ask for all memory."""
@@ -73,6 +74,21 @@ class Sequence:
         known = self.blocks() | {"truth": self.truth, "true_landmarks": self.true_landmarks}
         rows = (f"{len(block)} {name}" for name, block in known.items() if block is not None)
         return f"Sequence({self.name!r}: {self.duration_s:.1f} s, {', '.join(rows)})"
+
+    def _repr_html_(self) -> str:
+        """The blocks with their rows, times and rates, for a notebook."""
+        known = self.blocks() | {"truth": self.truth}
+        rows = []
+        for name, block in known.items():
+            if block is None or not len(block):
+                continue
+            first, last = ((int(stamp_ns) - self.start_ns) * 1e-9 for stamp_ns in block.stamps_ns[[0, -1]])
+            rate = f"{(len(block) - 1) / (last - first):.4g}" if last > first else ABSENT
+            rows.append([name, str(len(block)), f"{first:.2f}", f"{last:.2f}", rate])
+        if self.true_landmarks is not None:
+            rows.append(["true landmarks", str(len(self.true_landmarks)), *[ABSENT] * 3])
+        heads = ["Block", "Rows", "First (s)", "Last (s)", "Rate (Hz)"]
+        return as_html(text_table("sequence", f"Sequence {self.name}, {self.duration_s:.1f} s", heads, rows))
 
     def blocks(self) -> dict[str, Block]:
         """Measurements that there are, by their names in `Measurements`."""

@@ -1,9 +1,14 @@
 """Sections of settings, and messages about wrong ones that name each field and those that exist."""
 
-from collections.abc import Iterable, Iterator
+import ast
+import inspect
+import json
+import textwrap
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from difflib import SequenceMatcher
-from functools import partial
+from functools import lru_cache, partial
+from itertools import pairwise
 from types import UnionType
 from typing import Any, NamedTuple, TypeVar, Union, get_args, get_origin
 
@@ -73,8 +78,28 @@ def settings_of(model: type[BaseModel], default: BaseModel | None = None, sectio
         elif isinstance(value, BaseModel):
             found |= {setting.name: setting for setting in settings_of(type(value), value, f"{path}.")}
         else:
-            found[path] = Setting(path, value, " ".join((field.description or "").split()))
+            found[path] = Setting(path, value, " ".join(meanings_of(model).get(name, "").split()))
     return list(found.values())
+
+
+@lru_cache
+def meanings_of(model: type[BaseModel]) -> dict[str, str]:
+    """The text below each field of a class and of its bases, from their source.
+
+    Pydantic reads it for every class that it makes, which takes a third of a second when a comparison begins; it is
+    asked for where settings are listed.
+    """
+    found: dict[str, str] = {}
+    for kind in reversed(model.__mro__):
+        try:
+            (made,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
+        except (OSError, TypeError, SyntaxError, ValueError):  # made without a file
+            continue
+        for field, below in pairwise(getattr(made, "body", [])):
+            match field, below:
+                case ast.AnnAssign(target=ast.Name(name)), ast.Expr(ast.Constant(str(text))):
+                    found[name] = inspect.cleandoc(text)
+    return {name: text for name, text in found.items() if name in model.model_fields}
 
 
 def parse(model: type[M], values: object, source: str, refusal: type[Exception] = CalibrationError) -> M:
@@ -235,3 +260,93 @@ def _sections(annotation: Any) -> Iterator[type[BaseModel]]:
             yield from _sections(option)
     elif isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
+
+
+def toml_value(value: Any) -> str:
+    """A value as TOML, on one line."""
+    if isinstance(value, BaseModel):
+        return toml_value(value.model_dump(exclude_none=True))
+    if isinstance(value, str):
+        return _text(value)
+    if isinstance(value, bool):
+        return json.dumps(value)
+    if isinstance(value, int | float):
+        return repr(value)
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{toml_key(key)} = {toml_value(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, Sequence):
+        return "[" + ", ".join(map(toml_value, value)) + "]"
+    raise TypeError(f"{type(value).__name__} has no TOML form")
+
+
+def toml_key(name: str) -> str:
+    """A key as TOML, in quotes where it needs them."""
+    return name if name.replace("_", "").replace("-", "").isalnum() and name.isascii() else _text(name)
+
+
+def _text(value: str) -> str:
+    """A basic string: that of JSON, but for one character that TOML does not allow."""
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def toml_template(model: type[BaseModel], stated: BaseModel, remark: str) -> str:
+    """Commented TOML of all settings of a model with their meaning: those of ``stated`` that differ from the defaults.
+
+    The others are commented out, with the default; of a section that may be absent, its fields with an example. Read
+    back as it is, it gives ``stated``. ``remark``: after each line that is stated.
+    """
+    default = model()
+    lines = _template_lines(model, default, stated, "", remark, is_nested=False)
+    for name, field in model.model_fields.items():
+        section = next((part for part in get_args(field.annotation) if _is_section(part)), None)
+        value = getattr(stated, name)
+        if _is_section(field.annotation):
+            inside = _template_lines(type(value), getattr(default, name), value, "", remark)
+            lines += ["", f"# {_sentence(field.annotation.__doc__)}", f"[{name}]", *inside]
+        elif section is not None:
+            absent = "# " * (value is None)
+            lines += ["", f"# {_sentence(section.__doc__)}", f"{absent}[{name}]"]
+            lines += _template_lines(section, None, value, "", remark)
+    return "\n".join(lines) + "\n"
+
+
+def _template_lines(
+    model: type[BaseModel],
+    default: BaseModel | None,
+    stated: BaseModel | None,
+    prefix: str,
+    remark: str,
+    *,
+    is_nested: bool = True,
+) -> list[str]:
+    """A line for each setting of a section; those of sections in it under dotted names."""
+    lines: list[str] = []
+    for name, field in model.model_fields.items():
+        is_optional = any(_is_section(part) for part in get_args(field.annotation))
+        inner = field.annotation
+        if _is_section(inner):
+            if is_nested:
+                old, new = getattr(default, name, None), getattr(stated, name, None)
+                lines += _template_lines(inner, old, new, f"{prefix}{name}.", remark)  # type: ignore[arg-type]
+            continue
+        if is_optional:
+            continue
+        usual = 0.1 if field.is_required() else field.get_default()
+        usual = getattr(default, name, usual)
+        value = usual if stated is None else getattr(stated, name)
+        meaning = _sentence(meanings_of(model).get(name))
+        is_said = stated is not None and (value != usual or default is None)
+        shown = value if value is not None else 0.0
+        line = f"{prefix}{name} = {toml_value(shown)}"
+        notes = " ".join(filter(None, [meaning, f"({remark})" if is_said else ""]))
+        lines.append(("" if is_said else "# ") + line + (f"  # {notes}" if notes else ""))
+    return lines
+
+
+def _is_section(kind: object) -> bool:
+    return isinstance(kind, type) and issubclass(kind, BaseModel)
+
+
+def _sentence(text: str | None) -> str:
+    """Text on one line."""
+    return " ".join((text or "").split("\n\n")[0].split())

@@ -18,9 +18,14 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Floats, Ints
+from sonar_graph.table import ABSENT, as_html, text_table
 
 FIRST_ANONYMOUS_ID = 3_000_000_000
 """First identity given to landmarks that the recogniser has not named; identities of designs end at 2^31 - 1."""
+
+
+MOST_ROWS = 30
+"""Most landmarks that a notebook shows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +80,19 @@ class Trajectory:
     def __repr__(self) -> str:
         span = f", {self.stamps_ns[0]} to {self.stamps_ns[-1]} ns" if len(self) else ""
         return f"Trajectory({len(self)} poses{span})"
+
+    def _repr_html_(self) -> str:
+        """Times, length and extent, for a notebook."""
+        rows = [["poses", str(len(self))]]
+        if len(self):
+            length_m = np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum()
+            rows.append(["duration", f"{(int(self.stamps_ns[-1]) - int(self.stamps_ns[0])) * 1e-9:.2f} s"])
+            rows.append(["length of the path", f"{length_m:.2f} m"])
+            for axis, low, high in zip("xyz", self.positions.min(axis=0), self.positions.max(axis=0), strict=True):
+                rows.append([axis, f"{low:.3f} to {high:.3f} m"])
+            rows.append(["orientations", "known" if self.has_orientation else "unknown"])
+            rows.append(["covariances", "unknown" if np.isnan(self.covariances).all() else "known"])
+        return as_html(text_table("trajectory", "Trajectory", ["Quantity", "Value"], rows))
 
     @classmethod
     def from_estimates(cls, estimates: list[Estimate]) -> Trajectory:
@@ -179,6 +197,17 @@ class LandmarkMap:
 
     def __repr__(self) -> str:
         return f"LandmarkMap({len(self)} landmarks, ids {reprlib.repr(self.ids.tolist())})"
+
+    def _repr_html_(self) -> str:
+        """Positions with their standard deviations, for a notebook: of the first `MOST_ROWS` landmarks."""
+        sigmas = np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2))
+        rows = [
+            [str(id_), *(f"{at:.3f}" for at in position), *(ABSENT if np.isnan(one) else f"{one:.3f}" for one in sigma)]
+            for id_, position, sigma in zip(self.ids[:MOST_ROWS].tolist(), self.positions, sigmas, strict=False)
+        ]
+        left_out = f"; {len(self) - MOST_ROWS} more are not shown" if len(self) > MOST_ROWS else ""
+        heads = ["ID", "x (m)", "y (m)", "z (m)", "sigma x (m)", "sigma y (m)", "sigma z (m)"]
+        return as_html(text_table("landmark-map", f"Map of {len(self)} landmarks{left_out}", heads, rows))
 
 
 class Outcome(StrEnum):

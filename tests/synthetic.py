@@ -6,7 +6,7 @@ import numpy as np
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.calibration import Calibration, PlanarMotion
+from sonar_graph.calibration import Calibration, PlanarMotion, Start
 from sonar_graph.evaluation.comparison import judge
 from sonar_graph.evaluation.results import Comparison, RunResult, Score
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints, LandmarkDetections
@@ -86,7 +86,7 @@ def _sequence(stamps: Ints, truth: Trajectory | None, planar: bool) -> Sequence:
     ends, n = np.array([stamps[0] - STEP_NS, stamps[-1]]), len(stamps)
     return Sequence(
         name="basin-three-laps",
-        calibration=Calibration(planar=PlanarMotion() if planar else None),
+        calibration=Calibration(start=Start(), planar=PlanarMotion() if planar else None),
         imu=Imu(ends, np.zeros((2, 3)), np.zeros((2, 3))),
         dvl=Dvl(ends, np.zeros((2, 3)), np.zeros((2, 3, 3))),
         detections=LandmarkDetections(

@@ -358,7 +358,7 @@ def test_scenes_count_passes_of_landmarks_and_of_each_group_of_strangers_and_jud
 
 def test_an_error_that_repeats_counts_as_often_as_it_is_reported(scenes, monkeypatch):
     class Model:
-        report_interval = staticmethod(lambda: 10)
+        report_interval_s = 10.0
 
     monkeypatch.setattr(scenes, "read_confusion", lambda _: Model)
     found = scenes.summary([a_run([(k, 1, 1, 0.9, 1) for k in range(21)])], "r")

@@ -4,6 +4,7 @@ import ast
 import doctest
 import subprocess
 import sys
+import tomllib
 from collections import Counter
 from collections.abc import Iterator
 from importlib import import_module
@@ -94,7 +95,7 @@ def test_the_front_door_loads_nothing_heavy() -> None:
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
 
 
-@pytest.mark.parametrize("package", ["sonar_graph", "sonar_graph.devices", "sonar_graph.logs"])
+@pytest.mark.parametrize("package", ["sonar_graph", "sonar_graph.devices", "sonar_graph.logs", "sonar_graph.report"])
 def test_names_that_are_imported_at_first_use_are_those_that_are_listed(package: str) -> None:
     module = import_module(package)
     tree = ast.parse(Path(str(module.__file__)).read_text("utf-8"))
@@ -125,19 +126,42 @@ def run_examples(found: object, name: str) -> int:
     return runner.tries
 
 
-@pytest.mark.parametrize("name", sonar_graph.__all__)
-def test_every_public_name_has_an_example_that_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+NAMES = tomllib.loads((ROOT / "docs" / "reference" / "names.toml").read_text("utf-8"))
+LISTED = [(package, name) for package, names in NAMES.items() for name in names]
+
+
+@pytest.mark.parametrize(("package", "name"), LISTED, ids=[".".join(one) for one in LISTED])
+def test_every_name_of_the_reference_has_an_example_that_runs(
+    package: str, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
-    assert run_examples(getattr(sonar_graph, name), name) > 0
+    assert name in import_module(package).__all__
+    assert run_examples(getattr(import_module(package), name), name) > 0
 
 
-def public_objects(room: str) -> list[tuple[str, object]]:
-    module: ModuleType = import_module(f"sonar_graph.{room}")
-    named = ((name, getattr(module, name)) for name in module.__all__)
-    return [(f"{room}.{name}", found) for name, found in named if isinstance(found, type | FunctionType)]
+def test_the_reference_lists_all_of_the_front_door() -> None:
+    assert sorted(NAMES["sonar_graph"]) == sorted(sonar_graph.__all__)
+    assert set(NAMES) >= {f"sonar_graph.{room}" for room in ROOMS_WITH_EXAMPLES}
+    assert len({name for _, name in LISTED}) == len(LISTED)
+
+
+def test_an_example_that_is_wrong_is_found(capsys: pytest.CaptureFixture[str]) -> None:
+    def wrong() -> None:
+        """>>> 1 + 1
+        3
+        """
+
+    with pytest.raises(AssertionError, match="wrong"):
+        run_examples(wrong, "wrong")
+    assert "Expected" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("room", ROOMS_WITH_EXAMPLES)
 def test_examples_of_a_room_run(room: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also of those of its names that the reference does not list."""
     monkeypatch.chdir(tmp_path)
-    assert sum(run_examples(found, name) for name, found in public_objects(room)) > 0
+    module: ModuleType = import_module(f"sonar_graph.{room}")
+    others = {name: getattr(module, name) for name in module.__all__ if name not in NAMES[module.__name__]}
+    for name, found in others.items():
+        if isinstance(found, type | FunctionType):
+            run_examples(found, name)

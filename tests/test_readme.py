@@ -4,6 +4,7 @@ import ast
 import re
 import tomllib
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
@@ -14,6 +15,9 @@ ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 MESSAGES = (ROOT / "docs" / "messages.md").read_text(encoding="utf-8")
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+WITH_COMMANDS = ["README.md", "docs/messages.md", "docs/quick_start.md", "docs/three_ways.md", "docs/settings.md"]
+WITH_COMMANDS += ["docs/gallery/README.md"]
+WITH_COMMANDS += [path.relative_to(ROOT).as_posix() for path in sorted((ROOT / "docs" / "howto").glob("*.md"))]
 
 
 def blocks(language: str) -> list[str]:
@@ -73,22 +77,48 @@ def test_names_imported_in_examples_exist() -> None:
     assert [name for name in used if not hasattr(sonar_graph, name)] == []
 
 
-def test_commands_are_understood(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("page", WITH_COMMANDS)
+def test_commands_are_understood(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import typer.main
 
     from sonar_graph.cli.main import app
 
+    text = (ROOT / page).read_text(encoding="utf-8")
     monkeypatch.chdir(tmp_path)
-    Path("benchmarks/suites").mkdir(parents=True)
-    for name in ("dive.mcap", "dive.aris", "joined.mcap", "vehicle.toml", "benchmarks/suites/smoke.toml"):
-        Path(name).touch()
-    group = typer.main.get_command(app)
+    for name in re.findall(r"[\w./]+\.(?:mcap|toml|aris|raw|bag|json)\b", text):
+        if not Path(name).is_absolute():
+            Path(name).parent.mkdir(parents=True, exist_ok=True)
+            Path(name).touch()
+    for folder in ("results", "MRCLAM_Dataset6", "A-KIT", "STPERE"):
+        Path(folder).mkdir(exist_ok=True)
     lines = re.findall(
-        r"^    sonar-graph (.+)$|`sonar-graph ([a-z]+ [^`]*\.mcap[^`]*)`", README + MESSAGES, flags=re.MULTILINE
+        r"^ {4,8}sonar-graph ([^|\n]+)$|`sonar-graph ([a-z]+ [^`]*\.(?:mcap|toml|json)[^`]*)`", text, flags=re.MULTILINE
     )
-    assert len(lines) >= 4
-    for words in ((indented or inline).split() for indented, inline in lines):
-        group.commands[words[0]].make_context(words[0], words[1:])  # type: ignore[attr-defined]
+    assert lines
+    for words in ((indented or inline).partition(" > ")[0].split() for indented, inline in lines):
+        command, context = typer.main.get_command(app), None
+        while hasattr(command, "commands"):
+            command = command.commands[words.pop(0)] if words[0] in command.commands else command.commands["run"]
+            context = command.name
+        command.make_context(context, words)
+
+
+def test_settings_and_the_suite_on_their_page_exist(tmp_path: Path) -> None:
+    pytest.importorskip("dask", reason="needs sonar-graph[bench]")
+    from sonar_graph.batch import plan_runs, read_suite
+    from sonar_graph.slam import Isam2Params
+
+    text = (ROOT / "docs" / "settings.md").read_text(encoding="utf-8")
+    suite = tmp_path / "suite.toml"
+    suite.write_text(next(block for block in re.findall(r"```toml\n(.*?)```", text, re.DOTALL)), encoding="utf-8")
+    assert len(plan_runs(read_suite(suite))) == 6 * 3
+    named = re.findall(r"`([a-z_]+)\.([a-z_]+)[`.]", text)
+    assert len(named) >= 15
+    sections = {**Calibration.model_fields, **Isam2Params.model_fields}
+    for section, field in named:
+        kinds = get_args(sections[section].annotation) or (sections[section].annotation,)
+        kinds = tuple(kind for one in kinds for kind in (get_args(one) or (one,)))
+        assert any(field in getattr(kind, "model_fields", {}) for kind in kinds), f"{section}.{field}"
 
 
 def test_citation_names_the_version_of_the_package() -> None:
@@ -97,6 +127,9 @@ def test_citation_names_the_version_of_the_package() -> None:
     assert f"\nversion: {__version__}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
 
 
-def test_every_page_on_design_is_in_the_index() -> None:
-    index = (ROOT / "docs" / "README.md").read_text(encoding="utf-8")
-    assert [page.name for page in (ROOT / "docs" / "design").glob("*.md") if f"design/{page.name}" not in index] == []
+@pytest.mark.parametrize("folder", ["design", "theory", "tutorials"])
+def test_every_page_of_a_folder_is_in_its_index(folder: str) -> None:
+    index = (ROOT / "docs" / folder / "README.md").read_text(encoding="utf-8")
+    pages = [page.name for page in (ROOT / "docs" / folder).glob("*.md") if page.name != "README.md"]
+    assert len(pages) >= 5
+    assert [name for name in pages if f"({name})" not in index] == []

@@ -1,7 +1,9 @@
 """The tutorials run as they stand, and what they print is true."""
 
+import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import textwrap
@@ -24,12 +26,13 @@ TRUE_LANDMARKS = {1: (5.0, 0.0), 2: (7.0, -5.0), 3: (2.0, -7.0), 4: (0.0, -2.0)}
 
 
 def output(folder: Path, *command: object, **environment: str) -> str:
-    """Output of a command that ends well; the first word is an installed script."""
+    """Output of a command that ends well, or of `inspect` with a doubt; the first word is an installed script."""
     script, *words = map(str, command)
     asked = [Path(sys.executable).parent / script, *words]
     told = os.environ | environment
     done = subprocess.run(asked, cwd=folder, capture_output=True, text=True, timeout=600, env=told)
-    assert done.returncode == 0, f"{command}\n{done.stdout}{done.stderr}"
+    is_doubt = "inspect" in command and done.returncode in (1, 3) and not done.stderr.startswith("sonar-graph:")
+    assert done.returncode == 0 or is_doubt, f"{command}\n{done.stdout}{done.stderr}"
     return done.stdout
 
 
@@ -125,6 +128,8 @@ def test_page_on_own_logs_has_programs_a_configuration_and_commands_that_work(tm
         text = store.types["std_msgs/msg/String"]("hello")
         writer.write(connection, 1, store.serialize_ros1(text, "std_msgs/msg/String"))
     output(tmp_path, "python", "-W", "error", "-c", making)
+    (tmp_path / "my_bag").mkdir()
+    shutil.copy(tmp_path / "dive.mcap", tmp_path / "my_bag")
     printed = {}
     for line in re.findall(r"^    sonar-graph (.*)$", page, re.MULTILINE):
         words, _, target = line.partition(" > ")
@@ -181,10 +186,61 @@ def test_page_on_recordings_has_a_calibration_and_labels_that_are_read(tmp_path)
         assert all(option in said for option in options), words
 
 
+EXECUTE = """
+import sys, nbclient, nbformat
+notebook = nbformat.read(sys.argv[1], as_version=4)
+nbclient.NotebookClient(notebook, timeout=500, kernel_name="python3").execute()
+nbformat.write(notebook, "executed.ipynb")
+"""
+
+
+@pytest.mark.slow
+def test_the_notebook_is_stored_without_output_and_shows_tables_and_figures_when_it_is_run(tmp_path):
+    pytest.importorskip("nbclient", reason="nbclient is not installed: pip install nbclient ipykernel")
+    stored = json.loads((TUTORIALS / "12_notebook.ipynb").read_text("utf-8"))
+    codes = [cell for cell in stored["cells"] if cell["cell_type"] == "code"]
+    assert all(cell["outputs"] == [] and cell["execution_count"] is None for cell in codes)
+    output(tmp_path, "python", "-c", EXECUTE, TUTORIALS / "12_notebook.ipynb")
+    cells = json.loads((tmp_path / "executed.ipynb").read_text("utf-8"))["cells"]
+    shown = [one.get("data", {}) for cell in cells for one in cell.get("outputs", [])]
+    tables = ["".join(one["text/html"]) for one in shown if "text/html" in one]
+    assert [re.findall(r'<table id="table-([\w-]+)"', table)[0] for table in tables] == [
+        *("sequence", "compact", "trajectory", "landmark-map")
+    ]
+    assert sum("image/svg+xml" in one for one in shown) == 2
+    assert "at the same 240 instants" in "".join(cells[-1]["outputs"][0]["text"])
+
+
+def test_page_on_tables_has_a_program_and_a_configuration_that_give_the_simulated_run(tmp_path):
+    page = (TUTORIALS / "11_tables.md").read_text(encoding="utf-8")
+    ((making,), (configuration,)) = blocks(page, "python"), blocks(page, "toml")
+    output(tmp_path, "python", "-W", "error", "-c", making)
+    for line in re.findall(r"^    sonar-graph (.*)$", page, re.MULTILINE):
+        words, _, target = line.partition(" > ")
+        printed = output(tmp_path, "sonar-graph", *words.split())
+        if target:  # the guess is what the page says, but for the axes of the IMU
+            said = [row.partition("  #")[0] for row in printed.splitlines() if not row.startswith("#") and row]
+            assert said == [row for row in configuration.splitlines() if row and row != 'rotation = "frd"']
+            (tmp_path / target).write_text(configuration, encoding="utf-8")
+    truth = simulate_basin(BasinOptions(seed=1, duration_s=120.0, laps=1))
+    found = read_log(tmp_path / "dive.mcap")
+    np.testing.assert_allclose(found.imu.angular_velocity, truth.imu.angular_velocity, atol=1e-9)
+    np.testing.assert_allclose(found.imu.specific_force, truth.imu.specific_force, atol=1e-9)
+    np.testing.assert_allclose(found.dvl.velocity, truth.dvl.velocity, atol=1e-9)
+    np.testing.assert_allclose(found.depth.z_m, truth.depth.z_m, atol=1e-9)
+
+
+def test_first_page_makes_a_sequence_a_report_and_a_log_from_arrays(tmp_path):
+    (program,) = blocks((TUTORIALS / "README.md").read_text(encoding="utf-8"), "python")
+    output(tmp_path, "python", "-W", "error", "-c", program)
+    assert (tmp_path / "comparison" / "report.html").is_file()
+    assert read_log(tmp_path / "dive.mcap").depth.z_m[0] == -2.0
+
+
 def test_every_tutorial_is_listed_and_run():
     listed = (TUTORIALS / "README.md").read_text(encoding="utf-8")
     run_here = Path(__file__).read_text(encoding="utf-8")
-    for script in TUTORIALS.glob("0*"):
+    for script in (*TUTORIALS.glob("0*"), *TUTORIALS.glob("11*")):  # 10 is run in tests/live
         assert script.name in listed
         assert script.name in run_here
 

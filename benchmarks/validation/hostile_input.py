@@ -3,10 +3,11 @@
     python benchmarks/validation/hostile_input.py [--cases 600] [--interrupts 30] [--seed 0] [--quick]
 
 Each case of `hostile_files.py` is a command in a folder of its own, in a process of its own, which is forked from this
-one. It may end with any exit code of the commands (0, 1, 2) and must end in ten seconds. ``silent_errors`` are logs of
-which reading gives other measurements of IMU, Doppler log or depth than the sound log has, and neither an error nor a
-note says so; control characters on the terminal; and cells of a table that a spreadsheet would calculate.
-``files_lost`` are users' files that are not as they were. ``peak_rss_mb`` is the largest of all commands.
+one. It may end with any exit code of the commands (0 to 3); ``hangs`` are those that take more than ten seconds of the
+processor or a minute of the clock. ``silent_errors`` are logs of which reading gives other measurements of IMU, Doppler
+log or depth than the sound log has, and neither an error nor a note says so; control characters on the terminal; and
+cells of a table that a spreadsheet would calculate. ``files_lost`` are users' files that are not as they
+were. ``peak_rss_mb`` is the largest of all commands.
 
 Interrupts are SIGINT at random moments of ``sonar-graph compare`` on a log with gaps; ``interrupts_missed`` are those
 that do not end with "interrupted", exit code 130, and no file in the folder or all of them; ``interrupts_late`` came
@@ -19,6 +20,7 @@ import hashlib
 import io
 import json
 import os
+import resource
 import shutil
 import signal
 import stat
@@ -47,7 +49,7 @@ from sonar_graph.report.rendering import csv_text
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import BasinOptions, simulate_basin
 
-TIME_LIMIT_S, INTERRUPT_S = 10.0, 30.0
+PROCESSOR_LIMIT_S, TIME_LIMIT_S, INTERRUPT_S = 10, 60.0, 30.0
 LONGEST_PAUSE_S = 0.5
 """Longer ones between two looks at a command are those of a machine that stood still."""
 MOST_RSS_MB = 1500.0
@@ -73,11 +75,11 @@ class Outcome:
 
     @property
     def hung(self) -> bool:
-        return self.seconds >= TIME_LIMIT_S
+        return self.seconds >= TIME_LIMIT_S or self.code == -signal.SIGXCPU
 
     @property
     def crashed(self) -> bool:
-        return not self.hung and (self.code not in (0, 1, 2) or b"Traceback (most recent call last)" in self.err)
+        return not self.hung and (self.code not in (0, 1, 2, 3) or b"Traceback (most recent call last)" in self.err)
 
     def has_escapes(self) -> bool:
         """True for characters that a terminal obeys; what is printed is UTF-8."""
@@ -111,6 +113,7 @@ def run_apart(case: Case, folder: Path) -> Outcome:
     pid = os.fork()
     if pid == 0:
         os.setsid()
+        resource.setrlimit(resource.RLIMIT_CPU, (PROCESSOR_LIMIT_S, resource.RLIM_INFINITY))
         for path, target in ((out, 1), (err, 2)):
             os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT), target)
         code = 99

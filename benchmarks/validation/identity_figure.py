@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 
 from sonar_graph.report.figure_style import (
     MUTED,
+    arrange,
     blank_panels,
     colour,
     head_panel,
@@ -49,7 +50,8 @@ def draw(figures: Figures, path: Path) -> None:
             _panel(panels[row, column], cases, error)
             name_axes(panels[row, column], "wrong, %" if row == len(ROWS) - 1 else "", label if column == 0 else "")
         head_panel(panels[0, column], title)
-    legend_above(figure, panels[0, 0], columns=4)
+    legend_above(figure, panels[0, 0])
+    arrange(figure)
     figure.savefig(path, dpi=110, facecolor="white")
 
 

@@ -14,7 +14,7 @@ those of `recognition.py`, or from `--first-seed` on; the measured model that sh
 * `wrong_above_99`: share of the tracks with more than 0.99 at their end that are wrong;
 * `range_bias_m`, `azimuth_bias_deg`: mean error of right accepted detections, each pass as one;
 * `nis`: normalised error per degree of freedom, each pass as one; `nis_of_reports` that of the mean of the detections
-  that are reported as independent, one in every `Confusion.report_interval` frames: 1 if they were.
+  that are reported as independent, one in every `Confusion.report_interval_s`: 1 if they were.
 
 Intervals are Wilson's at 95 %, over passes. It passes when our rule reaches `LEAST_RECOGNISED` where one is given, and
 `MOST` everywhere.
@@ -84,7 +84,7 @@ def summary(runs: list[Run], rule: str, accepted_from: float = ACCEPTED) -> dict
     """Figures of one rule over all seeds, of detections that are accepted from this posterior on."""
     outcomes: dict[str, list[bool]] = {"recognised": [], "natural": [], "look_alikes": []}
     accepted, right, bias, ends, nis, nis_of_reports = 0, 0, [], [], [], []
-    interval = read_confusion(SHIPPED).report_interval()
+    interval_s = read_confusion(SHIPPED).report_interval_s
     for run in runs:
         found = run.detections[rule]
         is_accepted = found.is_named & (found.probability >= accepted_from)
@@ -99,7 +99,11 @@ def summary(runs: list[Run], rule: str, accepted_from: float = ACCEPTED) -> dict
                     rows = np.flatnonzero(hits)
                     bias.append(found.error[rows].mean(axis=0))
                     nis.append(float(normalised(found, rows).mean()))
-                    nis_of_reports.append(normalised_mean(found, rows[::interval]))
+                    reports = [rows[0]]
+                    for later in rows:
+                        if found.stamp_s[later] - found.stamp_s[reports[-1]] >= interval_s:
+                            reports.append(later)
+                    nis_of_reports.append(normalised_mean(found, np.array(reports)))
             else:
                 looks_alike = run.passes.kind[row] in GROUPS["look-alikes"]
                 outcomes["look_alikes" if looks_alike else "natural"].append(bool((is_accepted & of_it).any()))

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from sonar_graph.measurements import Floats
-from sonar_graph.report.figure_style import MUTED, blank_panels, colour, name_axes
+from sonar_graph.report.figure_style import MUTED, arrange, blank_panels, colour, name_axes
 from sonar_graph.sonar.bayes import jeffrey
 
 Update = Callable[[Floats, Floats], Floats]
@@ -105,6 +105,7 @@ def draw(path: str) -> None:
     name_axes(axes[0, 0], "frame, all with the same scores", "belief in landmark 1")
     name_axes(axes[0, 1], "frame")
     axes[0, 0].legend(frameon=False, fontsize=9, loc="center right", bbox_to_anchor=(1, 0.32))
+    arrange(figure)
     figure.savefig(path, dpi=130)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import tomllib
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -43,6 +43,7 @@ def run_suite(
     scheduler: str | None = None,
     timeout_s: float | None = None,
     retry_failed: bool = False,
+    only: Collection[str] = (),
     overwrite: bool = False,
     progress: Callable[[int, int, int], None] | None = None,
     notice: Callable[[str], None] | None = None,
@@ -66,6 +67,8 @@ def run_suite(
         Time limit of a run, in seconds; None: the suite's.
     retry_failed
         Do runs again that failed, timed out or were killed.
+    only
+        Keys of runs to do now, as `plan_runs` and the report give them; the others stay as they are. Empty: all.
     overwrite
         Replace suite and table in the folder also where they are another suite's, or not this package's.
     progress
@@ -82,8 +85,9 @@ def run_suite(
     Raises
     ------
     BatchError
-        When the suite has a mistake (with file, line and key), another batch runs in the folder, it holds the batch of
-        another suite, no worker can be had, or a package of the extra is missing. Runs that are done are kept.
+        When the suite has a mistake (with file, line and key), a key of ``only`` is of none of its runs, another batch
+        runs in the folder, it holds the batch of another suite, no worker can be had, or a package of the extra is
+        missing. Runs that are done are kept.
     KeyboardInterrupt
         On Ctrl-C or SIGTERM, with a message that tells how many runs are done.
 
@@ -119,13 +123,15 @@ def run_suite(
         raise BatchError(f"bench needs {lacking[0]}, which is not installed: {INSTALL}")
     file, folder = read_suite(Path(path)), Path(folder)
     with Batch.opened(file, folder, overwrite=overwrite) as batch:
+        chosen = batch.chosen(only)
         if retry_failed:
-            batch.discard_failed()
-        statuses = Counter(str(row["status"]) for row in batch.rows().values())
+            batch.discard_failed(chosen)
+        rows = batch.rows()
+        statuses = Counter(str(rows[run.key]["status"]) for run in chosen if run.key in rows)
 
         def report() -> None:
             if progress is not None:
-                progress(statuses.total(), len(batch.runs), statuses.total() - statuses["ok"])
+                progress(statuses.total(), len(chosen), statuses.total() - statuses["ok"])
 
         def count(_run: PlannedRun, outcome: RunOutcome) -> None:
             statuses[str(outcome.row["status"])] += 1
@@ -138,7 +144,7 @@ def run_suite(
                 if notice is not None:
                     for sentence in batch.large_logs():
                         notice(f"{sentence}; a run is ended after {limits.timeout_s:g} s")
-                batch.run(Where(workers, scheduler), limits, count)
+                batch.run(Where(workers, scheduler), limits, count, chosen)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(batch.resuming()) from None
     return read_batch(folder)
@@ -194,14 +200,27 @@ class Batch:
                 if said := expense(read_source(run.kind, run.options, run.seed, run.landmarks)):
                     yield f"A large log, {run.log}, {said}"
 
-    def discard_failed(self) -> None:
-        """Remove runs that did not succeed, so that they are done again."""
-        for key, row in self.rows().items():
-            if row["status"] != "ok":
-                self.store.discard(key)
+    def chosen(self, keys: Collection[str]) -> list[PlannedRun]:
+        """Runs of these keys; all without a key.
 
-    def run(self, where: Where, limits: Limits, progress: Progress) -> None:
-        """Do the runs that are not done, and write the table, also if the batch ends early.
+        Raises `BatchError` where a key is of no run: a run of other code, settings or logs has another.
+        """
+        if unknown := sorted(set(keys) - {run.key for run in self.runs}):
+            raise BatchError(
+                f"{self.file.path}: none of its {len(self.runs)} runs has the key {unknown[0]}; keys stand in the "
+                "report, and change with the code, the settings, the versions and the contents of logs"
+            )
+        return [run for run in self.runs if not keys or run.key in keys]
+
+    def discard_failed(self, chosen: Sequence[PlannedRun]) -> None:
+        """Remove those that did not succeed, so that they are done again."""
+        rows = self.rows()
+        for run in chosen:
+            if run.key in rows and rows[run.key]["status"] != "ok":
+                self.store.discard(run.key)
+
+    def run(self, where: Where, limits: Limits, progress: Progress, chosen: Sequence[PlannedRun] | None = None) -> None:
+        """Do the runs that are not done, or those chosen of them, and write the table, also if the batch ends early.
 
         Suite and table in the folder are replaced as soon as the first run of this plan is done, and not before. The
         table then names all runs, so a batch that is killed can be read without the code that planned it.
@@ -214,7 +233,7 @@ class Batch:
         from sonar_graph.batch import cluster  # Dask is of the extra `bench`
 
         done = self.rows()
-        missing = [run for run in self.runs if run.key not in done]
+        missing = [run for run in (self.runs if chosen is None else chosen) if run.key not in done]
         has_table = self._write_table_if_possible()
 
         def kept(run: PlannedRun, outcome: RunOutcome) -> None:

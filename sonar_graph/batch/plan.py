@@ -74,6 +74,16 @@ def plan_runs(file: SuiteFile) -> list[PlannedRun]:
     ------
     BatchError
         When the suite names something that does not exist or does not fit, or one run twice.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from sonar_graph.batch import plan_runs
+    >>> from sonar_graph.batch.suite import EstimatorEntry, LogEntry, Suite, SuiteFile
+    >>> basin, alone = LogEntry(name="basin", generator="basin", seeds=2), EstimatorEntry(name="dead-reckoning")
+    >>> suite = Suite(name="lap", reference=alone.name, logs=[basin], estimators=[alone])
+    >>> len(plan_runs(SuiteFile(Path("lap.toml"), "", suite)))
+    2
     """
     contestants = contestants_of(file)
     rate_hz = file.suite.rate_hz
@@ -167,6 +177,8 @@ def contestants_of(file: SuiteFile) -> list[_Contestant]:
 def sources_of(file: SuiteFile) -> list[_Source]:
     """Logs and simulations, grids multiplied out; no two of one name or with equal content for one seed.
 
+    An entry that says how to obtain its files is left out where they are absent.
+
     Raises `BatchError` with file, line and key.
     """
     found: list[_Source] = []
@@ -189,6 +201,9 @@ def sources_of(file: SuiteFile) -> list[_Source]:
             _validated(file, (*place, "landmarks"), LandmarkOptions, entry.landmarks)
         for chosen in _combinations(file, place, entry.grid, entry.options, "options"):
             values = ({} if entry.log is None else {"log": entry.log}) | entry.options | chosen
+            named = [values[name] for name in FILES if isinstance(values.get(name), str)]
+            if entry.obtain and not all(map(file.holds, named)):
+                continue
             for name in FILES:
                 if isinstance(values.get(name), str):
                     where = (*place, name) if name == "log" else (*place, "options", name)
@@ -202,6 +217,8 @@ def sources_of(file: SuiteFile) -> list[_Source]:
             stated = {name: value for name, value in values.items() if name not in FILES}
             label = _label(entry.name, chosen)
             found.append(_Source(place, entry, label, plain, fingerprint(entry.kind, plain), stated))
+    if not found:
+        file.refuse(("logs",), f"no data of any log is here; get {'; '.join(e.obtain for e in file.suite.logs)}")
     by_name: dict[str, _Source] = {}
     by_content: dict[str, str] = {}
     for source in found:

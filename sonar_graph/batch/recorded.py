@@ -7,6 +7,7 @@ its row is then read from the run's own folder.
 import contextlib
 import json
 import math
+import tomllib
 from collections import Counter
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -104,6 +105,18 @@ class RecordedBatch:
     def logs(self) -> list[str]:
         """Names of logs, in the order of the plan."""
         return list(dict.fromkeys(run.log for run in self._planned))
+
+    @cached_property
+    def absent(self) -> dict[str, str]:
+        """Source of each log of the suite that was left out, because its files were not there, by its name."""
+        with contextlib.suppress(ValueError):
+            entries = tomllib.loads(self.suite).get("logs", [])
+            return {
+                entry["name"]: entry["obtain"]
+                for entry in entries
+                if entry.get("obtain") and not any(f"{log}, ".startswith(f"{entry['name']}, ") for log in self.logs)
+            }
+        return {}
 
     @cached_property
     def contestants(self) -> list[str]:

@@ -19,8 +19,8 @@ from sonar_graph.calibration import Section
 from sonar_graph.files import regular
 from sonar_graph.logs import PartialCalibration, read_log
 from sonar_graph.logs.adapters import LogConfig, read_log_config
-from sonar_graph.logs.convert import read_akit, read_mrclam, read_victoria_park
-from sonar_graph.logs.mcap import LogFile, TimeWindow
+from sonar_graph.logs.convert import read_akit, read_dlr, read_mrclam, read_stpere, read_victoria_park
+from sonar_graph.logs.mcap import LogFile, TimeWindow, log_parts
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import (
     BasinOptions,
@@ -64,6 +64,12 @@ class AkitOptions(Section):
     trajectory: int = Field(ge=1)
 
 
+class FolderOptions(Section):
+    """A data set of one run: DLR, St. Pere."""
+
+    folder: str
+
+
 class VictoriaParkOptions(Section):
     """Victoria Park, from the file that GTSAM brings; no options."""
 
@@ -100,8 +106,9 @@ def _read_log(options: LogOptions) -> Sequence:
 
 def _check_log(options: LogOptions) -> None:
     """Raise for a file that is no log, and for options about it that cannot be understood."""
-    with LogFile(Path(options.log)):
-        _parsed(options)
+    for part in log_parts(Path(options.log)):
+        LogFile(part).close()
+    _parsed(options)
 
 
 GENERATORS: dict[str, SourceKind] = {
@@ -110,7 +117,9 @@ GENERATORS: dict[str, SourceKind] = {
 }
 DATASETS: dict[str, SourceKind] = {
     "akit": SourceKind(AkitOptions, lambda options: read_akit(Path(options.folder), options.trajectory)),
+    "dlr": SourceKind(FolderOptions, lambda options: read_dlr(Path(options.folder))),
     "mrclam": SourceKind(MrclamOptions, lambda options: read_mrclam(Path(options.folder), options.robot)),
+    "stpere": SourceKind(FolderOptions, lambda options: read_stpere(Path(options.folder))),
     "victoria-park": SourceKind(VictoriaParkOptions, lambda _options: read_victoria_park()),
 }
 LOG = "mcap"

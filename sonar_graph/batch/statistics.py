@@ -112,7 +112,16 @@ class Rate:
 
 @dataclass(frozen=True)
 class PairedDifference:
-    """Differences from the reference on the same cases; negative: smaller than the reference."""
+    """Differences from the reference on the same cases; negative: smaller than the reference.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sonar_graph.batch import paired
+    >>> difference = paired(np.array([1.0, 2.0, 3.0]), np.array([1.5, 2.5, 2.0]))
+    >>> difference.smaller, round(difference.mean, 3)
+    (2, 0.0)
+    """
 
     pairs: int
     """Number of differences: pairs of runs, or seeds if a seed has several pairs."""
@@ -143,7 +152,14 @@ class PairedDifference:
 
 @dataclass(frozen=True)
 class Anees:
-    """Average normalised squared error of independent runs, per degree of freedom, with its chi-square band."""
+    """Average normalised squared error of independent runs, per degree of freedom, with its chi-square band.
+
+    Examples
+    --------
+    >>> from sonar_graph.batch import Anees
+    >>> Anees(runs=50, mean=2.1, band=(0.79, 1.24)).verdict
+    'over-confident'
+    """
 
     runs: int
     mean: float
@@ -221,7 +237,15 @@ def standard_error(values: Floats) -> float:
 
 
 def failure_rate(failed: int, runs: int) -> Rate:
-    """Share of runs that failed, with its 95 % interval (Wilson 1927)."""
+    """Share of runs that failed, with its 95 % interval (Wilson 1927).
+
+    Examples
+    --------
+    >>> from sonar_graph.batch import failure_rate
+    >>> rate = failure_rate(1, 20)
+    >>> print(f"{rate.share:.2f}, {rate.low:.3f} to {rate.high:.3f}")
+    0.05, 0.009 to 0.236
+    """
     interval = stats.binomtest(failed, runs).proportion_ci(CONFIDENCE, method="wilson")
     return Rate(failed / runs, float(interval.low), float(interval.high))
 
@@ -239,6 +263,17 @@ def paired(own: Floats, reference: Floats, cases: Sequence[str | int] | None = N
         Case of each pair: a seed, or the name of a log for runs without seeds. Pairs of one case depend on each other
         and make one difference, their mean (infinite ones to the side that has more of them). None: each pair is a
         case of its own.
+
+    Examples
+    --------
+    Errors of six runs, in metres, beside the reference's on the same logs:
+
+    >>> import numpy as np
+    >>> from sonar_graph.batch import paired
+    >>> own = np.array([0.11, 0.14, 0.12, 0.10, 0.15, 0.13])
+    >>> difference = paired(own, own + np.array([0.02, 0.03, 0.01, 0.02, 0.03, 0.02]))
+    >>> round(difference.mean, 3), difference.pairs
+    (-0.022, 6)
     """
     lost = np.isinf(own) | np.isinf(reference)
     both = np.isinf(own) & np.isinf(reference)
@@ -308,6 +343,13 @@ def holm(p_values: Floats) -> Floats:
 
     In ascending order, the i-th of m (from 0) is multiplied by m - i; none may be below the one before it or above 1.
     NaN stays NaN and does not count.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sonar_graph.batch import holm
+    >>> holm(np.array([0.01, 0.04, 0.5])).round(3)
+    array([0.03, 0.08, 0.5 ])
     """
     corrected = np.full(len(p_values), np.nan)
     known = np.flatnonzero(~np.isnan(p_values))
@@ -322,6 +364,14 @@ def anees(nees: Floats, dof: float) -> Anees:
 
     ``nees`` is the normalised squared error of each run at one instant, divided by ``dof``, shape (n,); infinity: none.
     Unknown degrees of freedom (NaN) give no band.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sonar_graph.batch import anees
+    >>> found = anees(np.array([0.8, 1.3, 0.9, 1.1, 1.2]), 3)
+    >>> round(found.mean, 2), found.verdict
+    (1.06, 'consistent')
     """
     if not len(nees) or np.isinf(nees).any():
         return Anees(len(nees), math.nan, (math.nan, math.nan))

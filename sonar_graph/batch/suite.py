@@ -93,6 +93,8 @@ class LogEntry(Section):
     """Seeds of a generator or of ``landmarks``: their number, from 0 on, or a list."""
     landmarks: dict[str, Any] | None = None
     """Options of landmarks to be simulated on a recorded log."""
+    obtain: str = ""
+    """Source of the log or data set: where its files are absent the batch goes on without it, and the page says so."""
 
     @field_validator("seeds", mode="before")
     @classmethod
@@ -176,18 +178,25 @@ class SuiteFile:
         """
         raise BatchError(f"{self.path}, line {line_of(self.text, place)}: {'.'.join(map(str, place))}: {fault}")
 
+    def holds(self, name: str) -> bool:
+        """Tell whether a file or folder is where `find` looks for it."""
+        return any((root / name).exists() for root in self._roots())
+
     def find(self, place: Place, name: str) -> str:
         """Absolute path of a file or folder, relative to the suite's folder or else to the folder of data sets.
 
         Raises `BatchError` when it is in neither.
         """
-        roots = [self.path.parent, *([Path(os.environ[DATA_VARIABLE])] if os.environ.get(DATA_VARIABLE) else [])]
+        roots = self._roots()
         found = [root / name for root in roots if (root / name).exists()]
         if not found:
             looked = " or ".join(str(root.resolve()) for root in roots)
             more = "" if len(roots) > 1 else f"; {DATA_VARIABLE} can name another folder to look in"
             self.refuse(place, f"{name} is not in {looked}{more}")
         return str(found[0].resolve())
+
+    def _roots(self) -> list[Path]:
+        return [self.path.parent, *([Path(os.environ[DATA_VARIABLE])] if os.environ.get(DATA_VARIABLE) else [])]
 
 
 def read_suite(path: Path) -> SuiteFile:
@@ -197,6 +206,24 @@ def read_suite(path: Path) -> SuiteFile:
     ------
     BatchError
         When it cannot be read, is no TOML, or a value is missing, unknown or does not fit.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from sonar_graph.batch import read_suite
+    >>> text = '''
+    ... name = "lap"
+    ... reference = "dead-reckoning"
+    ... [[logs]]
+    ... name = "basin"
+    ... generator = "basin"
+    ... seeds = 2
+    ... [[estimators]]
+    ... name = "dead-reckoning"
+    ... '''
+    >>> written = Path("lap.toml").write_text(text)
+    >>> read_suite(Path("lap.toml")).suite.name
+    'lap'
     """
     try:
         text = text_of(path)

@@ -35,7 +35,10 @@ def existing_file(meaning: str, metavar: str = "FILE") -> Any:
 
 
 LogPath = Annotated[
-    Path, typer.Argument(metavar="LOG", exists=True, dir_okay=False, readable=True, help="MCAP log to read.")
+    Path,
+    typer.Argument(
+        metavar="LOG", exists=True, readable=True, help="MCAP log to read: a file, or the folder of a ROS 2 bag."
+    ),
 ]
 OutputLog = Annotated[Path, typer.Option("--output", "-o", metavar="OUT.mcap", help="MCAP log to write.")]
 Overwrite = Annotated[

@@ -48,6 +48,10 @@ def bench(
     retry_failed: Annotated[
         bool, typer.Option("--retry-failed", help="Do runs anew that failed, timed out or were killed.")
     ] = False,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(metavar="KEY", help="Do only the run of this key, which the report lists; can be repeated."),
+    ] = None,
     reference: Annotated[
         Path | None,
         typer.Option(
@@ -83,6 +87,7 @@ def bench(
                 scheduler=scheduler,
                 timeout_s=timeout_s,
                 retry_failed=retry_failed,
+                only=only or (),
                 overwrite=overwrite,
                 progress=progress,
                 notice=partial(echo, err=True),
@@ -90,7 +95,7 @@ def bench(
     except KeyboardInterrupt as error:
         echo(f"sonar-graph: interrupted; {error}".rstrip("; "), err=True)
         os._exit(INTERRUPTED)  # the ordinary way waits for threads, also for those of workers that are gone
-    counts = Counter(run.status for run in batch.runs)
+    counts = Counter(run.status for run in batch.runs if not only or run.key in only)
     told = sorted(counts.items(), key=lambda count: (count[0] != "ok", count[0]))
     echo(f"Runs: {', '.join(f'{number} {status}' for status, number in told)}")
     echo(f"Results: {output / 'results.parquet'}")
@@ -183,6 +188,7 @@ benches.command(
         "sonar-graph bench run suite.toml -o results --workers 2 --timeout 600",
         "sonar-graph bench run suite.toml -o results --scheduler tcp://10.0.0.5:8786",
         "sonar-graph bench run suite.toml -o results --gate reference.json",
+        "sonar-graph bench run suite.toml -o again --only 0123456789abcdef0123",
     ),
 )(bench)
 

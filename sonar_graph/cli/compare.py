@@ -245,7 +245,6 @@ def compare_log(
     from sonar_graph.evaluation import expense
     from sonar_graph.logs import LIVE_RATE, no_images
     from sonar_graph.logs.adapters import LogConfig
-    from sonar_graph.recognition import with_detections
 
     with progress_bars() as progress:
         sequence = reading.read(log, progress=partial(progress, f"reading {log.name}"))
@@ -255,13 +254,16 @@ def compare_log(
         said = "; ".join(f"{one.quantity}: {one.text()}" for one in doubted)
         sequence = replace(sequence, notes={**sequence.notes, "log.sensors": said})
     found = None
-    if sequence.detections is None or recognition.is_given:
+    is_of_live_run = LIVE_RATE in sequence.notes  # what was recognised is in it: estimates are those of the live run
+    if (sequence.detections is None and not is_of_live_run) or recognition.is_given:
         found = recognise_log(log, sequence, reading, recognition.recogniser(sequence.calibration))
         if found is None and recognition.is_given:
             raise LogError(f"{no_images(log)}; --designs, --model and --rule are for images")
     if found is not None:
         if recognition.designs is None:
             warn_of_other_designs(sequence)
+        from sonar_graph.recognition import with_detections
+
         sequence = with_detections(sequence, found)
     if said := expense(sequence):
         echo(f"A large log, {said}", err=True)

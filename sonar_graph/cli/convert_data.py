@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sonar_graph.cli.arguments import OutputLog, Overwrite, echo, examples
+from sonar_graph.cli.arguments import OutputLog, Overwrite, echo, examples, existing_file
 from sonar_graph.cli.outputs import progress_bars, working, writable_log
+from sonar_graph.errors import LogError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
 
     from sonar_graph.logs.convert import BagConversion, SonarConversion
     from sonar_graph.logs.mcap import Progress
@@ -21,15 +22,59 @@ if TYPE_CHECKING:
 
 datasets = typer.Typer(
     name="convert",
-    help="Convert a public data set, a ROS bag or a sonar's recording to an MCAP log.",
+    help="Convert text tables, a ROS bag, a sonar's recording or a public data set to an MCAP log.",
     epilog=examples(
         "sonar-graph convert victoria-park -o victoria_park.mcap",
         "sonar-graph convert mrclam MRCLAM_Dataset6 --robot 3 -o mrclam_6_3.mcap",
+        "sonar-graph convert csv imu.csv dvl.csv --toml > dive.toml",
+        "sonar-graph convert csv imu.csv dvl.csv --config dive.toml -o dive.mcap",
         "sonar-graph convert rosbag dive.bag -o dive.mcap",
         "sonar-graph convert aris dive.aris -o dive_sonar.mcap",
     ),
 )
 _MOST_LOSSES_SHOWN = 10
+
+
+@datasets.command(
+    epilog=examples(
+        "sonar-graph convert csv imu.csv dvl.csv --toml > dive.toml",
+        "sonar-graph convert csv imu.csv dvl.csv --config dive.toml -o dive.mcap",
+        "sonar-graph convert csv folder_of_tables --config dive.toml -o dive.mcap",
+    )
+)
+def csv(
+    tables: Annotated[
+        list[Path], typer.Argument(metavar="TABLES...", exists=True, help="Text files, or a folder that holds them.")
+    ],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="OUT.mcap", help="MCAP log to write.")
+    ] = None,
+    config: Annotated[
+        Path | None, existing_file("Which columns of which tables are what; --toml begins one.", "FILE.toml")
+    ] = None,
+    toml: Annotated[
+        bool, typer.Option("--toml", help="Print only a guess at FILE.toml, by the names of the columns, to edit.")
+    ] = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """Tables of any vehicle: IMU, Doppler log, depth, heading, fixes, detections, truth; delimiters are found."""
+    from sonar_graph.logs.convert import csv_template, read_csv
+
+    if toml:
+        echo(csv_template(tables), nl=False)
+        return
+    named = " ".join(map(str, tables))
+    if config is None:
+        raise LogError(f"--config is missing; `sonar-graph convert csv {named} --toml > dive.toml` begins one")
+    if output is None:
+        raise LogError("-o is missing; give the log to write, such as -o dive.mcap")
+    sequence = _convert(lambda: read_csv(tables, config), [*tables, config], output, overwrite)
+    for subject, heading in (("csv.left_out", "left out"), ("csv.warnings", "warning")):
+        if subject in sequence.notes:
+            echo(f"{heading}: {sequence.notes[subject]}", err=True)
+    echo(f"What is in it: sonar-graph inspect {output}")
+
+
 DatasetFolder = Annotated[
     Path, typer.Argument(metavar="DATASET_DIR", exists=True, file_okay=False, help="Folder of the data set.")
 ]
@@ -45,7 +90,7 @@ def mrclam(
     """UTIAS multi-robot data set: odometry, ranges and bearings to landmarks, motion-capture truth."""
     from sonar_graph.logs.convert import read_mrclam
 
-    _convert(lambda: read_mrclam(dataset, robot), dataset, output, overwrite)
+    _convert(lambda: read_mrclam(dataset, robot), [dataset], output, overwrite)
 
 
 @datasets.command("victoria-park", epilog=examples("sonar-graph convert victoria-park -o victoria_park.mcap"))
@@ -60,7 +105,7 @@ def victoria_park(
     """Victoria Park: a truck among trees, odometry and landmarks, no truth."""
     from sonar_graph.logs.convert import read_victoria_park
 
-    _convert(lambda: read_victoria_park(source), source, output, overwrite)
+    _convert(lambda: read_victoria_park(source), [source], output, overwrite)
 
 
 @datasets.command(epilog=examples("sonar-graph convert dlr DLR -o dlr.mcap"))
@@ -74,7 +119,7 @@ def dlr(
     """DLR Spatial Cognition: a robot in an office building, artificial landmarks with IDs, no truth."""
     from sonar_graph.logs.convert import read_dlr
 
-    _convert(lambda: read_dlr(dataset), dataset, output, overwrite)
+    _convert(lambda: read_dlr(dataset), [dataset], output, overwrite)
 
 
 @datasets.command(epilog=examples("sonar-graph convert akit A-KIT --trajectory 1 -o akit_1.mcap"))
@@ -87,7 +132,7 @@ def akit(
     """A-KIT: an autonomous underwater vehicle at sea, fibre-optic IMU and DVL, navigation-system reference."""
     from sonar_graph.logs.convert import read_akit
 
-    _convert(lambda: read_akit(dataset, trajectory), dataset, output, overwrite)
+    _convert(lambda: read_akit(dataset, trajectory), [dataset], output, overwrite)
 
 
 @datasets.command(epilog=examples("sonar-graph convert stpere StPereDataset -o stpere.mcap"))
@@ -95,7 +140,7 @@ def stpere(dataset: DatasetFolder, output: OutputLog, overwrite: Overwrite = Fal
     """St. Pere: an underwater vehicle in a marina, cheap IMU, compass and DVL, satellite positions as truth."""
     from sonar_graph.logs.convert import read_stpere
 
-    _convert(lambda: read_stpere(dataset), dataset, output, overwrite)
+    _convert(lambda: read_stpere(dataset), [dataset], output, overwrite)
 
 
 @datasets.command(
@@ -171,12 +216,13 @@ def _convert_file(
     echo(f"Log: {path}\nWhat is in it: sonar-graph inspect {path}")
 
 
-def _convert(read: Callable[[], Sequence], source: Path | None, output: Path, overwrite: bool) -> None:
+def _convert(read: Callable[[], Sequence], sources: Iterable[Path | None], output: Path, overwrite: bool) -> Sequence:
     from sonar_graph.logs import write_log
 
-    path = writable_log(output, source, overwrite=overwrite)
+    path = writable_log(output, *sources, overwrite=overwrite)
     with working("converting"):
         sequence = read()
         write_log(path, sequence)
     detections = len(sequence.detections) if sequence.detections else 0
     echo(f"{sequence.name}: {sequence.duration_s:.1f} s, {detections} landmark detections\nLog: {path}")
+    return sequence

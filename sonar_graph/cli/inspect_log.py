@@ -1,8 +1,9 @@
-"""``sonar-graph inspect``: the topics of a log, their roles, and whether its sensors agree."""
+"""``sonar-graph inspect`` and ``calibration``: what a log has, whether sensors agree, what it says of itself."""
 
 from __future__ import annotations
 
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -11,12 +12,18 @@ from rich.table import Table
 
 from sonar_graph.cli.arguments import LogPath, ReadingOptions, answers, echo, with_options
 from sonar_graph.cli.outputs import working
-from sonar_graph.errors import SonarGraphError
+from sonar_graph.errors import CalibrationError, SonarGraphError
 
 if TYPE_CHECKING:
     from sonar_graph.diagnosis import Finding
     from sonar_graph.logs import LogSummary
 
+UNUSABLE, DOUBTFUL = 1, 3
+"""Exit codes; 2 is a mistake of the user."""
+HEAD = """\
+# Calibration for --calibration FILE. A line that is commented out has the default, which counts where neither this file
+# nor the log says something else. Units are in the names or after the lines; angles are in rad, lengths in m.
+"""
 MOST_TOPICS = 500
 """Rows of the table for people; a log may have tens of thousands."""
 
@@ -37,7 +44,11 @@ def inspect(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print everything as one JSON object.")] = False,
 ) -> None:
-    """Say what is in a log: topics, rates, gaps, which topic would be used for what and why, what sensors disagree."""
+    """Say what is in a log: topics, rates, gaps, which topic would be used for what and why, what sensors disagree.
+
+    Ends with 0 where nothing is in doubt, 3 where the log can be used but something is in doubt (warnings, lines to
+    act on), and 1 where it cannot be used as it is: no IMU or Doppler log, contradictions, damage.
+    """
     from sonar_graph.files import strict_json
     from sonar_graph.logs import inspect_log
 
@@ -48,6 +59,7 @@ def inspect(
         return
     findings: list[Finding] = []
     skipped = large = ""
+    is_usable = not (summary.obstacles or summary.unusable or summary.damage)
     if quick:
         skipped = "not compared: --quick"
     elif summary.obstacles:
@@ -57,21 +69,27 @@ def inspect(
         from sonar_graph.evaluation import expense
         from sonar_graph.logs import read_log
 
+        is_read = False
         try:
             with working("comparing sensors"):
                 sequence = read_log(
                     log, calibration=given, config=config, topics=reading.choices, window=reading.window
                 )
+                is_read = True
                 large = expense(sequence)
                 findings = check_sensors(sequence, config)
         except SonarGraphError as error:
-            skipped = f"not compared: {error}"
+            skipped, is_usable = f"not compared: {error}", is_usable and is_read
     if as_json:
         content = asdict(summary) | {"path": str(summary.path), "duration_s": summary.duration_s}
         content |= {"obstacles": summary.obstacles, "sensors": [finding.plain() for finding in findings]}
         echo(strict_json(content | {"sensors_skipped": skipped, "large": large}))
     else:
         print_summary(summary, findings, skipped, large)
+    if not is_usable:
+        raise typer.Exit(UNUSABLE)
+    if summary.warnings or any(finding.acts for finding in findings):
+        raise typer.Exit(DOUBTFUL)
 
 
 def print_summary(summary: LogSummary, findings: list[Finding], skipped: str, large: str = "") -> None:
@@ -124,6 +142,8 @@ def print_summary(summary: LogSummary, findings: list[Finding], skipped: str, la
             say("stamps", f"{topic.name}: {fault}", "bold yellow")
     for warning in summary.warnings:
         say("warning", warning, "bold yellow")
+    for reason in summary.unusable:
+        say("not usable as it is", reason, "bold red")
     for loss in summary.damage:
         say("damage", loss, "bold red")
     if summary.obstacles:
@@ -131,3 +151,31 @@ def print_summary(summary: LogSummary, findings: list[Finding], skipped: str, la
         console.print(f"[bold red]not usable for compare[/]: {lacking}", soft_wrap=True)
         hint = escape(f"sonar-graph inspect {summary.path} --toml > log.toml")
         console.print(f"Say what its topics are: {hint}, edit it, and give --log-config log.toml", soft_wrap=True)
+
+
+@with_options("salvage")
+def calibration(
+    reading: ReadingOptions,
+    log: Annotated[
+        Path | None,
+        typer.Argument(metavar="[LOG]", exists=True, help="MCAP log whose calibration and mountings count."),
+    ] = None,
+    template: Annotated[bool, typer.Option("--template", help="Print all fields with units and defaults.")] = False,
+) -> None:
+    """Print a calibration file to edit: all fields with units, meaning and defaults, and what a log already says."""
+    from sonar_graph.calibration import Calibration
+    from sonar_graph.logs import read_log
+    from sonar_graph.settings import toml_template
+
+    if not template:
+        raise CalibrationError("give --template: `sonar-graph calibration --template dive.mcap > vehicle.toml`")
+    stated, source = Calibration(), ""
+    if log is not None:
+        window = reading.window
+        sequence = read_log(
+            log, calibration=reading.given, topics=reading.choices, config=reading.config, window=window
+        )
+        stated, source = sequence.calibration, f"# {log.name}: {sequence.notes['log.calibration']}\n"
+    elif reading.given is not None:
+        raise CalibrationError("--calibration: give a log too, for which it counts")
+    echo(f"{HEAD}{source}\n{toml_template(Calibration, stated, f'by {log.name}' if log else '')}", nl=False)

@@ -55,9 +55,7 @@ def join(
             metavar="IMAGES", exists=True, dir_okay=False, help="Log with sonar images, or an .aris or .ddf file."
         ),
     ],
-    navigation: Annotated[
-        Path, typer.Argument(metavar="NAV", exists=True, dir_okay=False, help="MCAP log with IMU and Doppler log.")
-    ],
+    navigation: Annotated[Path, typer.Argument(metavar="NAV", exists=True, help="MCAP log with IMU and Doppler log.")],
     output: OutputLog,
     reading: ReadingOptions,
     offset: Annotated[

@@ -17,13 +17,14 @@ from sonar_graph.cli.arguments import (
     echo,
     estimator_settings,
 )
+from sonar_graph.cli.outputs import working
 from sonar_graph.errors import LogError
-from sonar_graph.files import interrupt_event
+from sonar_graph.files import COMPARISON, interrupt_event, result_written, write_json
 
 if TYPE_CHECKING:
     from sonar_graph.live import Publisher
 
-RECORD = "record.mcap"
+RECORD, COUNTS = "record.mcap", "live.json"
 DOMAIN = Annotated[int, typer.Option(min=0, max=232, help="ROS_DOMAIN_ID.")]
 
 
@@ -61,9 +62,12 @@ def live(
 ) -> None:
     """Estimate while the robot moves: topics of ROS 2 over zenoh in, poses and landmarks out, and a record.
 
-    Writes DIR/record.mcap: everything that came, from which `run` gives the same estimates, bit for bit.
+    Writes DIR/record.mcap: everything that came, from which `run` gives the same estimates, bit for bit; at the end
+    what `run` writes, and live.json with numbers of messages.
     """
-    from sonar_graph.evaluation import check_request
+    import numpy as np
+
+    from sonar_graph.evaluation import RunResult, check_request, judge, write_comparison, write_viewer_files
     from sonar_graph.live import (
         DEFAULT_ROUTER,
         LiveOptions,
@@ -72,9 +76,8 @@ def live(
         open_link,
         open_outlets,
         recorded_messages,
-        write_outcome,
     )
-    from sonar_graph.logs import LiveRecord
+    from sonar_graph.logs import LiveRecord, read_log
 
     reading = ReadingOptions(calibration, topics, log_config)
     record = output / RECORD
@@ -82,7 +85,7 @@ def live(
         advice = f"continue it with --resume {record} and another folder" if resume is None else "name another folder"
         raise LogError(f"{record}: a record is there already: {advice}")
     overrides = estimator_settings(settings, [estimator]).get(estimator, {})
-    check_request(estimator, overrides)
+    params = check_request(estimator, overrides)
     options = LiveOptions(estimator, overrides, rate_hz, lateness, reading.choices, reading.config, reading.given)
     with open_link(connect or [DEFAULT_ROUTER], domain) as link, interrupt_event() as ended:
         output.mkdir(parents=True, exist_ok=True)
@@ -92,6 +95,8 @@ def live(
             if resume is not None:
                 last_ns = run.catch_up(recorded_messages(resume), dropped_messages(resume))
                 echo(f"resumed from {resume}: blind for {(time.time_ns() - last_ns) * 1e-9:.1f} s")
+            else:  # after a crash nobody waits for it
+                run.wait_for_recogniser()
             gc.freeze()  # what was loaded is never looked at again, which would delay a pose
             link.listen(run.accept, run.wants)
             echo(f"listening to {', '.join(connect or [DEFAULT_ROUTER])}, domain {domain}; the record is {record}")
@@ -106,7 +111,24 @@ def live(
     if outcome is None:
         raise LogError(f"nothing was estimated: {run.lacking()}; what came is in {record}")
     counts = run.counts()
-    write_outcome(output, estimator, outcome, counts)
+    write_json(output / COUNTS, {"estimator": estimator, "messages": counts})
+    result = RunResult(
+        estimator,
+        params or overrides,
+        "ok",
+        causal=outcome.causal,
+        smoothed=outcome.smoothed,
+        landmarks=outcome.landmarks,
+        refused=outcome.refused,
+        withheld=outcome.withheld,
+        update_s=np.array(outcome.update_s),
+        finish_s=outcome.finish_s,
+    )
+    with working("writing results"):
+        comparison = judge(read_log(record), outcome.causal.stamps_ns, [result])
+        with result_written(output, COMPARISON):
+            write_comparison(comparison, output)
+            write_viewer_files(comparison, output)
     echo(f"{sum(counts['received'].values())} messages, {sum(counts['lost'].values())} lost")
     for what in ("lost", "dropped"):
         for name, number in counts[what].items():

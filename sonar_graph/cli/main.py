@@ -1,8 +1,8 @@
 """The commands: thin layers over the library, one module for each group.
 
-Exit codes: 0 done; 1 a comparison with a failed run (everything is written), or a batch that is worse than its
-reference; 2 a mistake of the user, reported in one line on stderr; 130 interrupted. Only unforeseen errors end in a
-traceback.
+Exit codes: 0 done; 1 a comparison with a failed run (everything is written), a batch that is worse than its reference,
+or an inspected log that cannot be used as it is; 2 a mistake of the user, in one line on stderr; 3 an inspected
+log with something in doubt; 130 interrupted. Only unforeseen errors end in a traceback.
 """
 
 import contextlib
@@ -18,11 +18,12 @@ from sonar_graph.cli.arguments import examples, printable
 from sonar_graph.cli.bench import benches
 from sonar_graph.cli.compare import compare, demo, estimators, report, run
 from sonar_graph.cli.convert_data import datasets
-from sonar_graph.cli.inspect_log import inspect
+from sonar_graph.cli.inspect_log import calibration, inspect
 from sonar_graph.cli.join import join
 from sonar_graph.cli.label import label
 from sonar_graph.cli.live import live, play
 from sonar_graph.cli.recognise import calibrate, recognise
+from sonar_graph.cli.show import figures, view
 from sonar_graph.cli.simulate import worlds
 from sonar_graph.errors import SonarGraphError
 from sonar_graph.files import INTERRUPTED, end_at_once, noticed_interrupts, terminations_as_interrupts
@@ -42,6 +43,12 @@ app.add_typer(worlds)
 app.add_typer(datasets)
 app.add_typer(benches)
 app.command(epilog=examples("sonar-graph inspect dive.mcap", "sonar-graph inspect dive.mcap --toml"))(inspect)
+app.command(
+    epilog=examples(
+        "sonar-graph calibration --template > vehicle.toml",
+        "sonar-graph calibration --template dive.mcap > vehicle.toml",
+    )
+)(calibration)
 app.command(
     epilog=examples(
         "sonar-graph run dive.mcap --estimator isam2 -o out",
@@ -79,6 +86,8 @@ app.command(
 )(live)
 app.command(epilog=examples("sonar-graph play dive.mcap", "sonar-graph play dive.mcap --rate 3"))(play)
 app.command(epilog=examples("sonar-graph report comparison"))(report)
+app.command(epilog=examples("sonar-graph figures comparison", "sonar-graph figures comparison -o paper"))(figures)
+app.command(epilog=examples("sonar-graph view comparison", "sonar-graph view comparison --viewer browser"))(view)
 app.command(epilog=examples("sonar-graph estimators"))(estimators)
 app.command(epilog=examples("sonar-graph demo -o demo"))(demo)
 

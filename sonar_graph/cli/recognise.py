@@ -206,9 +206,7 @@ def recognise(
 
 @with_options("start", "end")
 def calibrate(
-    logs: Annotated[
-        list[Path], typer.Argument(metavar="LOG...", exists=True, dir_okay=False, help="Logs with images and truth.")
-    ],
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", exists=True, help="Logs with images and truth.")],
     output: Annotated[Path, typer.Option("--output", "-o", metavar="MODEL.json", help="File to write.")],
     reading: ReadingOptions,
     labels: Annotated[
@@ -276,11 +274,9 @@ def calibrate(
         frames, tracks = (measured.provenance[f"{what} of {name}"] for what in ("frames", "tracks"))
         answers().print(f"  {name}: {frames} frame{'s'[frames == '1' :]}, {tracks} track{'s'[tracks == '1' :]}")
         few += [name] if int(tracks) < FEW_TRACKS else []
-    interval = measured.report_interval()
     answers().print(
-        f"  range sigma {1e3 * measured.range_sigma_m:.1f} mm, azimuth sigma {measured.azimuth_sigma_rad:.4f} rad, "
-        f"error correlation {measured.error_correlation:.2f} between frames of a track: "
-        + ("every frame is reported" if interval == 1 else f"one frame in {interval} is reported")
+        f"  range sigma {1e3 * measured.range_sigma_m:.1f} mm, across {1e3 * measured.across_sigma_m:.1f} mm, "
+        f"a track is reported every {measured.report_interval_s:.1f} s"
     )
     if few:
         answers().print(

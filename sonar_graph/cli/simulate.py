@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 def landmarks(
     log: Annotated[
         Path,
-        typer.Option("--on", metavar="LOG", exists=True, dir_okay=False, help="MCAP log with a reference trajectory."),
+        typer.Option("--on", metavar="LOG", exists=True, help="MCAP log with a reference trajectory."),
     ],
     output: OutputLog,
     reading: ReadingOptions,

@@ -39,6 +39,20 @@ def velocity_of_beams(
     Returns
     -------
     Velocity, shape (n, 3), m/s, and covariance, shape (n, 3, 3), m²/s², along the axes of the directions.
+
+    Examples
+    --------
+    Four beams at 30° from the vertical, of a vehicle that moves ahead; the last beam is lost:
+
+    >>> import numpy as np
+    >>> from sonar_graph.devices import velocity_of_beams
+    >>> tilt, turns = np.radians(30.0), np.radians([0, 90, 180, 270])
+    >>> level = np.sin(tilt) * np.column_stack([np.cos(turns), np.sin(turns)])
+    >>> directions = np.column_stack([level, np.full(4, -np.cos(tilt))])
+    >>> along = (directions @ [0.5, 0.0, 0.0])[None]
+    >>> velocity, covariance = velocity_of_beams(directions, along, np.array([[True, True, True, False]]), 0.01)
+    >>> velocity.round(6) + 0.0
+    array([[0.5, 0. , 0. ]])
     """
     velocity = np.zeros((len(valid), 3))
     covariance = np.empty((len(valid), 3, 3))

@@ -9,6 +9,7 @@ with a PNG file for each landmark::
     name = "ring"
     size_m = 0.40                 # side of the square picture
     height_m = 0.013              # height over the floor; optional
+    relief_m = 0.012              # height of bright parts over dark ones; optional, default: all of height_m
     picture = "ring.png"          # grey 0 ... 255; beside the TOML file
     black_db = -8.0               # level of 0 ...
     white_db = 12.0               # ... and of 255; transparent pixels are floor
@@ -55,7 +56,17 @@ _Length = Annotated[float, Field(allow_inf_nan=False)]
 
 @dataclass(frozen=True, eq=False)
 class LandmarkDesign:
-    """A landmark: its identity and its mask of scattering levels."""
+    """A landmark: its identity and its mask of scattering levels.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sonar_graph.devices import LandmarkDesign
+    >>> bright = np.full((100, 100), 12.0)
+    >>> design = LandmarkDesign(id=7, name="square", size_m=0.2, mask=bright)
+    >>> design.size_m / len(design.mask)
+    0.002
+    """
 
     id: int
     """Identity, as in maps and detections."""
@@ -66,7 +77,14 @@ class LandmarkDesign:
     """Level over the floor in dB, shape (n, n); NaN: floor. Seen from above with the first row at +y and the first
     column at -x."""
     height_m: float = 0.013
-    """Height of its face over the floor: 12 mm of foam on 1 mm of metal."""
+    """Height of its face over the floor."""
+    relief_m: float | None = None
+    """Height of its bright parts over its dark ones; None: all of its height, for the dark ones are thin."""
+
+    @property
+    def standing_m(self) -> float:
+        """Height by which its bright parts stand over what is around them, at most its own."""
+        return self.height_m if self.relief_m is None else min(self.relief_m, self.height_m)
 
     def level_db(self, x_m: Floats, y_m: Floats) -> Floats:
         """Level over the floor at points of the design's frame (origin at its centre); NaN outside."""
@@ -78,9 +96,10 @@ class LandmarkDesign:
         return np.where(inside, self.mask[np.clip(row, 0, last), np.clip(column, 0, last)], np.nan)
 
     def digest(self) -> str:
-        """16 hexadecimal digits that change with name, size, height or mask (from 0.01 dB on)."""
+        """16 hexadecimal digits that change with name, size, height, relief or mask (from 0.01 dB on)."""
         counts = np.where(np.isnan(self.mask), -(2**31), np.round(100 * np.nan_to_num(self.mask)))
-        text = f"{self.name}\n{self.size_m:.6f}\n{self.height_m:.6f}\n{self.mask.shape}\n"
+        relief = "" if self.relief_m is None else f"{self.relief_m:.6f}\n"
+        text = f"{self.name}\n{self.size_m:.6f}\n{self.height_m:.6f}\n{relief}{self.mask.shape}\n"
         return hashlib.sha256(text.encode() + counts.astype("<i4").tobytes()).hexdigest()[:16]
 
     def looks_like(self, other: LandmarkDesign) -> bool:
@@ -123,6 +142,7 @@ class _Entry(Section):
     name: str = Field(min_length=1)
     size_m: float = Field(ge=LEAST_SIZE_M, le=MOST_SIZE_M, allow_inf_nan=False)
     height_m: float = Field(0.013, ge=0, le=1, allow_inf_nan=False)
+    relief_m: float | None = Field(None, ge=0, le=1, allow_inf_nan=False)
     shapes: tuple[_Shape, ...] = ()
     picture: str | None = None
     black_db: _Level = -8.0
@@ -163,7 +183,7 @@ class _Entry(Section):
                 f"nowhere more than {brightest_db:g} dB over the floor, it would never stand out of it; "
                 f"give a part of it at least {LEAST_BRIGHT_DB:g} dB"
             )
-        return LandmarkDesign(self.id, self.name, self.size_m, mask, self.height_m)
+        return LandmarkDesign(self.id, self.name, self.size_m, mask, self.height_m, self.relief_m)
 
 
 def read_picture(path: Path, black_db: float, white_db: float) -> Floats:
@@ -200,6 +220,21 @@ def load_designs(path: Path) -> tuple[LandmarkDesign, ...]:
     ------
     CalibrationError
         Naming the file and field, when there is none, one is impossible, or two share an identity or look the same.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from sonar_graph.devices import load_designs
+    >>> text = '''
+    ... [[landmark]]
+    ... id = 7
+    ... name = "disc"
+    ... size_m = 0.30
+    ... shapes = [{ level_db = 12.0, circle_m = [0.0, 0.0, 0.10] }]
+    ... '''
+    >>> written = Path("mine.toml").write_text(text)
+    >>> [design.name for design in load_designs(Path("mine.toml"))]
+    ['disc']
     """
     path = Path(path)
     files = sorted(path.glob("*.toml")) if path.is_dir() else [path]

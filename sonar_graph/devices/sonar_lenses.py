@@ -42,7 +42,15 @@ angle to the right in degrees; a table that ends in the middle is continued anti
 
 
 def even_azimuths(beams: int, half_angle_deg: float) -> Floats:
-    """Middles of equal parts of the sector, the first beam right-most, radians to the left, shape (beams,)."""
+    """Middles of equal parts of the sector, the first beam right-most, radians to the left, shape (beams,).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sonar_graph.devices import even_azimuths
+    >>> np.degrees(even_azimuths(4, 15.0)).round(2)
+    array([-11.25,  -3.75,   3.75,  11.25])
+    """
     return np.radians(half_angle_deg * (2 * np.arange(beams) + 1 - beams) / beams)
 
 
@@ -52,6 +60,13 @@ def didson_azimuths(beams: int) -> Floats:
     The manufacturer's polynomial gives the beam for an angle; here it is inverted. It is monotonic in the sector.
 
     Source: ``lens_distortion.m`` of the manufacturer's MATLAB tools ("empirical work at the barge").
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sonar_graph.devices import didson_azimuths
+    >>> np.degrees(didson_azimuths(96)[[0, -1]]).round(2)
+    array([-14.26,  14.25])
     """
     angles_deg = np.linspace(-16.0, 16.0, 32_001)
     numbers = np.polynomial.polynomial.polyval(angles_deg, _DIDSON_POLYNOMIALS[beams])
@@ -65,6 +80,15 @@ def aris_azimuths(beams: int, *, telephoto: bool) -> Floats | None:
     The manufacturer's tables (composite lenses, averages of several) between some of their rows, to 0.005°.
 
     Source: ``beam-width-metrics`` of SoundMetrics/aris-file-sdk (MIT).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sonar_graph.devices import aris_azimuths
+    >>> np.degrees(aris_azimuths(48, telephoto=False)[[0, -1]]).round(2)
+    array([-13.57,  13.57])
+    >>> aris_azimuths(50, telephoto=False) is None
+    True
     """
     if (beams, telephoto) not in _ARIS_TABLES:
         return None

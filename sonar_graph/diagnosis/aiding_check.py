@@ -12,8 +12,10 @@ from dataclasses import replace
 import numpy as np
 
 from sonar_graph.diagnosis.findings import (
+    IN_CALIBRATION,
     IN_LOG_CONFIG,
     INTERVAL_SIGMAS,
+    LEAST_BIAS_RAD_S,
     NO_NEED,
     Finding,
     in_degrees,
@@ -25,6 +27,7 @@ from sonar_graph.measurements import NS_PER_S, Floats, Heading, Imu, Ints, Posit
 from sonar_graph.navigation.alignment import Estimate1D
 from sonar_graph.sequence import Sequence
 
+HEADING_SENSE = "heading: turn over that of the gyros"
 WINDOW_NS = 10 * NS_PER_S
 FEWEST_WINDOWS = 6
 LARGEST_HEADING_SIGMA_RAD = 0.25
@@ -37,13 +40,16 @@ FARTHEST_ORIGIN_M = 1e5
 """No vehicle of a run goes so far; coordinates of a map grid begin beyond."""
 
 
+def upwards(imu: Imu, body_R_imu: Floats) -> Floats:
+    """Typical vertical in the IMU's axes, shape (3,), by gravity; the body's z without accelerometers."""
+    force = imu.specific_force[np.isfinite(imu.specific_force).all(axis=1)]
+    up = np.median(force, axis=0) if len(force) else body_R_imu.T @ [0.0, 0.0, 1.0]
+    return np.asarray(up / np.linalg.norm(up))
+
+
 def turned_about_up(imu: Imu, body_R_imu: Floats, at_ns: Ints) -> Floats:
     """Turn by the gyros about the vertical since the first row, shape (n,), rad; level without accelerometers."""
-    up = np.array([0.0, 0.0, 1.0])
-    force = imu.specific_force[np.isfinite(imu.specific_force).all(axis=1)]
-    if len(force):
-        up = body_R_imu @ np.median(force, axis=0)
-    rate = imu.angular_velocity @ body_R_imu.T @ (up / np.linalg.norm(up))
+    rate = imu.angular_velocity @ upwards(imu, body_R_imu)
     steps = (rate[1:] + rate[:-1]) / 2 * np.diff(imu.stamps_ns) * 1e-9
     return np.interp(at_ns, imu.stamps_ns, np.concatenate([[0.0], np.cumsum(steps)]))
 
@@ -65,12 +71,48 @@ def heading_sense(sequence: Sequence, heading: Heading, config: LogConfig) -> Fi
     if sense.is_known and matters(sense, 0.0) and sense.value < 0:
         world = "enu" if config.table("heading").get("world") == "ned" else "ned"
         advice = f'it turns against the gyros, clockwise: `world = "{world}"` under [heading] {IN_LOG_CONFIG}'
-        return Finding("heading: turn over that of the gyros", sense, "", advice, acts=True)
+        return Finding(HEADING_SENSE, sense, "", advice, acts=True)
     is_stuck = sense.is_known and sense.value + INTERVAL_SIGMAS * sense.sigma < 0.5
     advice = (
         "it hardly turns where the gyros do: stuck, or not of the body; `use = false` under [heading] " + IN_LOG_CONFIG
     )
-    return Finding("heading: turn over that of the gyros", sense, "", advice if is_stuck else NO_NEED, is_stuck)
+    return Finding(HEADING_SENSE, sense, "", advice if is_stuck else NO_NEED, is_stuck)
+
+
+def vertical_bias(sequence: Sequence) -> Finding | None:
+    """Bias of the gyros about the vertical, by a heading or by true orientations; None without either.
+
+    Windows of the gyros' turn x and the heading's y give ``b = mean(x - y) / T``, less the bias that is known.
+    """
+    source = "the heading"
+    if (heading := sequence.heading) is not None:
+        stamps_ns, yaw_rad = heading.stamps_ns, np.unwrap(heading.yaw_rad)
+    elif (truth := sequence.true_poses) is not None and len(truth) > 1:
+        source = "the true orientations"
+        stamps_ns, yaw_rad = truth.stamps_ns, np.unwrap(truth.rotations().as_euler("ZYX")[:, 0])
+    else:
+        return None
+    ends = np.arange(max(sequence.start_ns, stamps_ns[0]), min(sequence.end_ns, stamps_ns[-1]) + 1, WINDOW_NS)
+    imu, known = sequence.imu, np.array(sequence.calibration.imu.gyro_bias_rad_s)
+    body_R_imu = sequence.calibration.imu.mounting.pose().rotation().matrix()
+    up = upwards(imu, body_R_imu)
+    rate = (np.diff(turned_about_up(imu, body_R_imu, ends)) - np.diff(np.interp(ends, stamps_ns, yaw_rad))) / (
+        WINDOW_NS / NS_PER_S
+    )
+    bias = Estimate1D(np.nan, np.inf, f"too little time beside {source}")
+    if len(rate) >= FEWEST_WINDOWS:
+        sigma = float(np.std(rate)) / float(np.sqrt(len(rate)))
+        bias = Estimate1D(float(np.mean(rate)) - float(up @ known), max(sigma, 1e-9))
+    allowed = sequence.calibration.imu.gyro_bias_sigma
+    acts = matters(replace(bias, sigma=float(np.hypot(bias.sigma, allowed))), LEAST_BIAS_RAD_S)
+    advice = f"by {source}; the calibration's sigma of {allowed:.2g} allows it, {NO_NEED}"
+    if acts:
+        whole = known + bias.value * up
+        advice = (
+            f"by {source}, {np.degrees(bias.value):.3g}°/s beyond the calibration's sigma of {allowed:.2g}: "
+            f"`imu.gyro_bias_rad_s = {numbers(whole, 5)}` {IN_CALIBRATION}"
+        )
+    return Finding("gyro bias about the vertical", bias, "rad/s", advice, acts)
 
 
 def heading_findings(right: Sequence, config: LogConfig) -> Iterator[Finding]:
@@ -96,7 +138,7 @@ def heading_findings(right: Sequence, config: LogConfig) -> Iterator[Finding]:
     acts = matters(replace(angle, sigma=float(np.hypot(angle.sigma, allowed))), 0.0)
     advice = f"the calibration's bias sigma of {allowed:.2g} rad allows it, {NO_NEED}"
     if acts:
-        offset = float(config.table("heading").get("yaw_offset_rad", 0.0)) + angle.value
+        offset = config.number("heading", "yaw_offset_rad", 0.0) + angle.value
         line = f"`yaw_offset_rad = {offset:.3f}` under [heading] {IN_LOG_CONFIG}"
         advice = f"its world, north or mounting is another: {line}"
     yield Finding("heading: turn towards the positions", in_degrees(angle), "°", advice, acts)

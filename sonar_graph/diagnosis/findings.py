@@ -37,7 +37,21 @@ IN_LOG_CONFIG = "in the log configuration (--log-config FILE)"
 
 @dataclass(frozen=True)
 class Finding:
-    """One quantity with its uncertainty, and the advice that follows."""
+    """One quantity with its uncertainty, and the advice that follows.
+
+    Examples
+    --------
+    Velocities that were logged in mm/s:
+
+    >>> from dataclasses import replace
+    >>> from sonar_graph.diagnosis import check_sensors
+    >>> from sonar_graph.testing import small_world
+    >>> world = small_world()
+    >>> wrong = replace(world, dvl=replace(world.dvl, velocity=1000 * world.dvl.velocity))
+    >>> finding = check_sensors(wrong)[0]
+    >>> finding.quantity, finding.acts
+    ('DVL: unit', True)
+    """
 
     quantity: str
     estimate: Estimate1D

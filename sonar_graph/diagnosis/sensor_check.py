@@ -15,7 +15,13 @@ from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import DvlCalibration, Start
-from sonar_graph.diagnosis.aiding_check import heading_findings, heading_sense, position_findings
+from sonar_graph.diagnosis.aiding_check import (
+    HEADING_SENSE,
+    heading_findings,
+    heading_sense,
+    position_findings,
+    vertical_bias,
+)
 from sonar_graph.diagnosis.findings import (
     IN_CALIBRATION,
     IN_LOG_CONFIG,
@@ -75,7 +81,7 @@ def wrong_units(sequence: Sequence, config: LogConfig) -> list[Finding]:
     is_far = changes_m is not None and changes_m[1] > LARGEST_RANGE_RATIO * changes_m[0]
     if speed_m_s > FASTEST_M_S or is_far:
         unit = next((unit for unit, factor in SPEEDS.items() if speed_m_s * factor <= USUAL_SPEED_M_S), "mm/s")
-        scale = float(config.table("dvl").get("scale", 1.0)) * SPEEDS[unit]
+        scale = config.number("dvl", "scale", 1.0) * SPEEDS[unit]
         why = f"up to {speed_m_s:.3g} m/s"
         if is_far and changes_m is not None:
             why += "; ranges to landmarks change by {:.3g} m, by them by {:.3g} m".format(*changes_m)
@@ -91,7 +97,7 @@ def wrong_units(sequence: Sequence, config: LogConfig) -> list[Finding]:
     if not doubt and tilting and tilting[0] > max(LEAST_TILTING_RAD_S, LARGEST_TILT_RATIO * tilting[1]):
         doubt = "too large (they tilt the vehicle by {:.2g} rad/s, gravity by {:.2g})".format(*tilting)
     if doubt:
-        scale = float(config.table("imu").get("angular_velocity_scale", 1.0)) * np.radians(1.0)
+        scale = config.number("imu", "angular_velocity_scale", 1.0) * np.radians(1.0)
         advice["gyro: unit"] = (
             f"rates look {doubt}: degrees a second? `angular_velocity_scale = {scale:.5g}` under [imu] {IN_LOG_CONFIG}"
         )
@@ -99,7 +105,7 @@ def wrong_units(sequence: Sequence, config: LogConfig) -> list[Finding]:
     typical = float(np.median(forces)) if len(forces) else 0.0
     unit = min(FORCES, key=lambda unit: abs(typical * FORCES[unit] - gravity))
     if len(forces) and not abs(typical * FORCES[unit] / gravity - 1) > SHARE_OF_GRAVITY:
-        scale = float(config.table("imu").get("linear_acceleration_scale", 1.0)) * FORCES[unit]
+        scale = config.number("imu", "linear_acceleration_scale", 1.0) * FORCES[unit]
         advice["accelerometer: unit"] = (
             f"specific forces are typically {typical:.4g} instead of {gravity:.4g} m/s²: {unit}? "
             f"`linear_acceleration_scale = {scale:.6g}` under [imu] {IN_LOG_CONFIG}"
@@ -109,7 +115,7 @@ def wrong_units(sequence: Sequence, config: LogConfig) -> list[Finding]:
 
 
 def doubts(sequence: Sequence, config: LogConfig) -> list[Finding]:
-    """Findings to act on that a run can tell at once: wrong units, else sense of a heading, unit and place of fixes.
+    """Findings to act on that a run can tell at once: wrong units, else heading, gyro bias, unit and place of fixes.
 
     What needs a Doppler log that is put right (`check_sensors`) is left to ``inspect``.
     """
@@ -117,6 +123,8 @@ def doubts(sequence: Sequence, config: LogConfig) -> list[Finding]:
         return faults
     heading = sequence.heading
     senses = [] if heading is None else [heading_sense(sequence, heading, config)]
+    if not any(sense.acts for sense in senses) and (vertical := vertical_bias(sequence)) is not None:
+        senses.append(vertical)
     return [finding for finding in (*senses, *position_findings(sequence, config)) if finding.acts]
 
 
@@ -203,6 +211,13 @@ def check_sensors(sequence: Sequence, config: LogConfig | None = None) -> list[F
         As a run would read it.
     config
         Log configuration of the reading; corrections are added to it.
+
+    Examples
+    --------
+    >>> from sonar_graph.diagnosis import check_sensors
+    >>> from sonar_graph.testing import small_world
+    >>> [finding.quantity for finding in check_sensors(small_world()) if finding.acts]
+    []
     """
     config = config or LogConfig()
     if faults := wrong_units(sequence, config):
@@ -222,6 +237,10 @@ def check_sensors(sequence: Sequence, config: LogConfig | None = None) -> list[F
     tilt = find_start_tilt(right)
     bias = bias_findings(*surest_bias(match, tilt), sequence.calibration.imu)
     aiding = [*heading_findings(right, config), *position_findings(right, config)]
+    vertical = vertical_bias(sequence)
+    is_mirrored = any(finding.quantity == HEADING_SENSE and finding.acts for finding in aiding)
+    if vertical is not None and vertical.estimate.is_known and not is_mirrored:
+        bias = [*(f for f in bias if f.estimate.is_known or f.acts), vertical]
     return [*of_dvl, *lever, *bias, *aiding, *reference_findings(right, config, tilt), *noise_findings(sequence)]
 
 
@@ -234,7 +253,7 @@ def dvl_findings(found: DvlMatch, sequence: Sequence, config: LogConfig) -> list
         rpy = numbers(_turned(sequence.calibration.dvl, found.yaw.value), 4)
         yaw_advice = f"turn the DVL's mounting: `dvl.mounting.rpy_rad = {rpy}` {IN_CALIBRATION}"
     if scales:
-        scale = float(config.table("dvl").get("scale", 1.0)) * found.scale.value
+        scale = config.number("dvl", "scale", 1.0) * found.scale.value
         scale_advice = f"scale the DVL's velocities: `scale = {scale:.4f}` under [dvl] {IN_LOG_CONFIG}"
     return [
         _offset("DVL against IMU", found.offset, sequence.imu, "dvl", config)[0],
@@ -316,7 +335,7 @@ def _offset(quantity: str, offset: Estimate1D, imu: Imu, role: str, config: LogC
     """Row for a time offset, and the offset with the uncertainty of the instant that an IMU sample stands for."""
     interval_s = float(np.median(np.diff(imu.stamps_ns))) / NS_PER_S if len(imu) > 1 else 0.0
     offset = replace(offset, sigma=float(np.hypot(offset.sigma, interval_s / np.sqrt(12))))
-    total_s = float(config.table(role).get("stamp_offset_s", 0.0)) + offset.value
+    total_s = config.number(role, "stamp_offset_s", 0.0) + offset.value
     acts = matters(offset, LEAST_OFFSET_S)
     advice = f"shift its stamps: `stamp_offset_s = {total_s:.3f}` under [{role}] {IN_LOG_CONFIG}"
     return Finding(f"{quantity}: time offset", offset, "s", advice if acts else NO_NEED, acts), offset

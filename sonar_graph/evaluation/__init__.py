@@ -4,27 +4,27 @@
 from sonar_graph.evaluation.comparison import LIBRARIES, compare, describe_environment, expense, judge
 from sonar_graph.evaluation.consistency import (GATED_SHARE, NONE, UNJUDGED, Reliability, anees_interval, confidences,
     nis, normalised_squares, reliability_of, true_identities)
-from sonar_graph.evaluation.digits import ABSENT, between, fixed, format_value, quantile_text, supported, with_error
+from sonar_graph.evaluation.digits import between, fixed, format_value, quantile_text, supported, with_error
 from sonar_graph.evaluation.ensemble import run_ensembles
 from sonar_graph.evaluation.metrics import landmark_errors, rmse, scored_map, yaw_rad
 from sonar_graph.evaluation.own_map import own_map_errors
-from sonar_graph.evaluation.results import (MOST_ROWS_NAMED, Comparison, Ensemble, ErrorSeries, RefusedRows, RunResult,
-    Score, gathered)
+from sonar_graph.evaluation.results import (MOST_ROWS_NAMED, Comparison, Ensemble, ErrorSeries, RefusedRows,
+    RunResult, Score, gathered)
 from sonar_graph.evaluation.run import check_request, one_line, run_estimator
-from sonar_graph.evaluation.scored_instants import (
-    DURATION_S, MAP_TIMES_S, RETURN_M, map_instants, published_maps, repeats_published)
+from sonar_graph.evaluation.scored_instants import (DURATION_S, MAP_TIMES_S, RETURN_M, map_instants, published_maps,
+    repeats_published)
 from sonar_graph.evaluation.scores import ESTIMATES
 from sonar_graph.evaluation.storage import read_comparison, write_comparison, write_viewer_files, result_names
-from sonar_graph.evaluation.tables import (LABELS, SCORES, Cell, Column, Table, absent, as_html, count, number,
-    run_columns, score_keys, score_table, text_table, words)
+from sonar_graph.evaluation.tables import (FITTED, HEADLINES, LABELS, SCORES, compact_table, headline_metric, label,
+    run_columns, score_keys, score_table, unaligned)
 __all__ = [
-    "ABSENT", "Cell", "Column", "Comparison", "DURATION_S", "ESTIMATES", "Ensemble", "ErrorSeries", "GATED_SHARE",
-    "LABELS", "LIBRARIES", "MAP_TIMES_S", "MOST_ROWS_NAMED", "NONE", "RETURN_M", "RefusedRows", "Reliability",
-    "RunResult", "SCORES", "Score", "Table", "UNJUDGED", "absent", "anees_interval", "as_html", "between",
-    "check_request", "compare", "confidences", "count", "describe_environment", "expense", "fixed", "format_value",
-    "gathered", "judge", "landmark_errors", "map_instants", "nis", "normalised_squares", "number", "one_line",
+    "Comparison", "DURATION_S", "ESTIMATES", "Ensemble", "ErrorSeries", "FITTED", "GATED_SHARE", "HEADLINES", "LABELS",
+    "LIBRARIES", "MAP_TIMES_S", "MOST_ROWS_NAMED", "NONE", "RETURN_M", "RefusedRows", "Reliability", "RunResult",
+    "SCORES", "Score", "UNJUDGED", "anees_interval", "between", "check_request", "compact_table",
+    "compare", "confidences", "describe_environment", "expense", "fixed", "format_value", "gathered",
+    "headline_metric", "judge", "label", "landmark_errors", "map_instants", "nis", "normalised_squares", "one_line",
     "own_map_errors", "published_maps", "quantile_text", "read_comparison", "reliability_of", "repeats_published",
-    "result_names", "rmse", "run_columns", "run_ensembles", "run_estimator", "score_keys", "score_table", "scored_map",
-    "supported", "text_table", "true_identities", "with_error", "words", "write_comparison", "write_viewer_files",
-    "yaw_rad",
+    "result_names", "rmse", "run_columns", "run_ensembles", "run_estimator", "score_keys", "score_table",
+    "scored_map", "supported", "true_identities", "unaligned", "with_error", "write_comparison",
+    "write_viewer_files", "yaw_rad",
 ]

@@ -15,6 +15,7 @@ import numpy as np
 
 from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation.consistency import error_series
+from sonar_graph.evaluation.free_start import with_fitted_truth
 from sonar_graph.evaluation.own_map import shared_map_instants
 from sonar_graph.evaluation.results import Comparison, ErrorSeries, Kind, RunResult, Score
 from sonar_graph.evaluation.run import check_request, run_estimator
@@ -26,6 +27,7 @@ from sonar_graph.evaluation.scores import (
     resource_scores,
     trajectory_scores,
 )
+from sonar_graph.evaluation.tables import FITTED, unaligned
 from sonar_graph.files import spelt
 from sonar_graph.measurements import Ints
 from sonar_graph.sequence import Sequence, require_sequence
@@ -160,6 +162,7 @@ def expense(sequence: Sequence) -> str:
 def judge(sequence: Sequence, instants_ns: Ints, runs: list[RunResult]) -> Comparison:
     """Score runs that were all asked for estimates at these instants, shape (n,)."""
     environment = describe_environment()
+    sequence = with_fitted_truth(sequence, instants_ns, runs)
     errors: dict[str, dict[Kind, ErrorSeries]] = {}
     scores: dict[str, dict[str, Score]] = {run.estimator: {} for run in runs}
     ended = [run for run in runs if run.status != "failed"]
@@ -174,7 +177,8 @@ def judge(sequence: Sequence, instants_ns: Ints, runs: list[RunResult]) -> Compa
         environment["scored instants"] = "none: the log has no truth, so no trajectory error can be given"
         return comparison
     scored = scored_instants(instants_ns, sequence.truth, runs)
-    environment["scored instants"] = str(scored)
+    fitted = f"; {unaligned(sequence)}" if FITTED in sequence.notes else ""
+    environment["scored instants"] = f"{scored}{fitted}"
     if len(scored) < LEAST_INSTANTS:
         environment["scored instants"] += ": too few for any trajectory error"
         return comparison
@@ -188,7 +192,7 @@ def judge(sequence: Sequence, instants_ns: Ints, runs: list[RunResult]) -> Compa
         for kind, trajectory in both.items():
             estimate = rows_at(trajectory, scored.stamps_ns)
             series = errors[run.estimator][kind] = error_series(estimate, truth, position_dof)
-            scores[run.estimator] |= trajectory_scores(kind, estimate, truth, series, str(scored))
+            scores[run.estimator] |= trajectory_scores(kind, estimate, truth, series, str(scored), unaligned(sequence))
     map_instants_ns = shared_map_instants(ended, sequence, scored.stamps_ns)
     for run in ended:
         scores[run.estimator] |= own_map_scores(run, sequence, map_instants_ns)

@@ -6,8 +6,8 @@ its second where the first is 1. The minus sign is typographic.
 
 import math
 
-ABSENT = "\N{EN DASH}"
-"""Stands where there is no number."""
+from sonar_graph.table import ABSENT
+
 MINUS = "\N{MINUS SIGN}"
 MOST_DECIMALS = 12
 """A value that is zero at so many decimals is written with a power of ten."""

@@ -59,6 +59,17 @@ def run_ensembles(
         Processes; None: one a core.
     progress
         Called with a subject, the number of runs done and their total.
+
+    Examples
+    --------
+    In a script, which needs the first line because it starts processes:
+
+    >>> if __name__ == "__main__":
+    ...     from sonar_graph.evaluation import run_ensembles
+    ...     from sonar_graph.simulation import BasinOptions
+    ...
+    ...     experiments = {"no bias": BasinOptions(duration_s=130.0, laps=1, gyro_bias_scale=0.0)}
+    ...     (ensemble,) = run_ensembles(experiments, range(20), ["isam2", "ekf-slam"])
     """
     members: dict[tuple[str, int], _Member] = {}
     total = len(experiments) * len(seeds)

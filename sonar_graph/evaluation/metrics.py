@@ -106,7 +106,15 @@ def align_yaw(points: Floats, targets: Floats) -> Alignment:
 
 
 def rmse(errors: Floats) -> float:
-    """Root of the mean squared norm of the rows: errors of shape (n,) or (n, d)."""
+    """Root of the mean squared norm of the rows: errors of shape (n,) or (n, d).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sonar_graph.evaluation import rmse
+    >>> round(rmse(np.array([[3.0, 4.0], [0.0, 0.0]])), 3)
+    3.536
+    """
     return float(np.sqrt(np.mean(np.square(errors)) * errors[0].size))
 
 
@@ -116,7 +124,16 @@ def wrapped(angles_rad: Floats) -> Floats:
 
 
 def yaw_rad(matrices: Floats) -> Floats:
-    """Heading of the body's x axis, ``atan2(R[1, 0], R[0, 0])``, shape (n,)."""
+    """Heading of the body's x axis, ``atan2(R[1, 0], R[0, 0])``, shape (n,).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sonar_graph.evaluation import yaw_rad
+    >>> from sonar_graph.testing import small_world
+    >>> np.degrees(yaw_rad(small_world().true_poses.rotations().as_matrix())[[0, -1]]).round(1)
+    array([ 0. , 57.3])
+    """
     return np.asarray(np.arctan2(matrices[:, 1, 0], matrices[:, 0, 0]))
 
 
@@ -218,7 +235,18 @@ class LandmarkErrors:
 
 
 def landmark_errors(estimated: LandmarkMap, true: LandmarkMap) -> LandmarkErrors:
-    """Compare two maps; landmarks in only one of them are left out."""
+    """Compare two maps; landmarks in only one of them are left out.
+
+    Examples
+    --------
+    >>> from sonar_graph import run_estimator
+    >>> from sonar_graph.evaluation import landmark_errors
+    >>> from sonar_graph.testing import small_world
+    >>> world = small_world()
+    >>> errors = landmark_errors(run_estimator(world, "isam2").landmarks, world.true_landmarks)
+    >>> errors.ids
+    array([ 4,  9, 11])
+    """
     ids, rows, true_rows = np.intersect1d(estimated.ids, true.ids, return_indices=True)
     points, targets = estimated.positions[rows], true.positions[true_rows]
     aligned = horizontal_aligned_rmse(points, targets) if len(ids) >= 2 else float("nan")

@@ -7,16 +7,19 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from html import escape
 from itertools import groupby
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from sonar_graph.evaluation.digits import format_value
-from sonar_graph.evaluation.tables import as_html, score_table
+from sonar_graph.evaluation.tables import compact_table, score_table
 from sonar_graph.measurements import Floats, Ints
-from sonar_graph.recognition import Recognition
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import DetectionLog, LandmarkMap, Refusal, RefusedRow, Trajectory
+from sonar_graph.table import as_html
+
+if TYPE_CHECKING:
+    from sonar_graph.recognition import Recognition
 
 Kind = Literal["causal", "smoothed"]
 TOLERATED_FACTOR = 2.0
@@ -80,7 +83,16 @@ class RunResult:
 
 @dataclass(frozen=True)
 class Score:
-    """A number with everything that is needed to read it."""
+    """A number with everything that is needed to read it.
+
+    Examples
+    --------
+    >>> from sonar_graph import compare
+    >>> from sonar_graph.testing import small_world
+    >>> score = compare(small_world(), ["dead-reckoning"]).scores["dead-reckoning"]["causal.ate_raw_m"]
+    >>> score.unit, score.better
+    ('m', 'lower')
+    """
 
     value: float
     unit: str
@@ -125,7 +137,16 @@ class Score:
 
 @dataclass(frozen=True, eq=False)
 class ErrorSeries:
-    """Errors of one estimate against the truth, raw (not aligned), at each scored instant."""
+    """Errors of one estimate against the truth, raw (not aligned), at each scored instant.
+
+    Examples
+    --------
+    >>> from sonar_graph import compare
+    >>> from sonar_graph.testing import small_world
+    >>> errors = compare(small_world(), ["dead-reckoning"]).errors["dead-reckoning"]["causal"]
+    >>> errors.position_m.shape[1] == errors.position_dof
+    True
+    """
 
     stamps_ns: Ints
     """Shape (n,)."""
@@ -151,7 +172,18 @@ class ErrorSeries:
 
 @dataclass(frozen=True)
 class Ensemble:
-    """Runs of one experiment by seed; lists of an estimator have one entry a run, None where it failed."""
+    """Runs of one experiment by seed; lists of an estimator have one entry a run, None where it failed.
+
+    Examples
+    --------
+    Two runs, of which the second failed:
+
+    >>> from sonar_graph.evaluation import Ensemble
+    >>> nees = {"isam2": {"position": [[0.9, 1.1], None]}}
+    >>> ensemble = Ensemble("murky", [1, 2], [30.0, 60.0], {"isam2": {}}, {"isam2": [[0.02, 0.03], None]}, nees)
+    >>> sum(errors is None for errors in ensemble.errors_m["isam2"])
+    1
+    """
 
     condition: str
     """The experiment in words, as a sentence goes on after "runs"."""
@@ -213,9 +245,11 @@ class Comparison:
         return [run for run in self.runs if run.status == "failed"]
 
     def _repr_html_(self) -> str:
-        """The scores as a table, for a notebook; below them, why runs failed."""
+        """The scores that are read first, for a notebook; folded below them all others, and why runs failed."""
         failed = (f"<p>{escape(run.estimator)} failed: {escape(run.reason)}</p>" for run in self.failed_runs)
-        return f"<p><strong>{escape(self.sequence.name)}</strong></p>\n{as_html(score_table(self))}\n{''.join(failed)}"
+        every = f"<details><summary>All scores</summary>\n{as_html(score_table(self))}\n</details>"
+        name = f"<p><strong>{escape(self.sequence.name)}</strong></p>"
+        return "\n".join([name, *failed, as_html(compact_table(self)), every])
 
 
 @dataclass(frozen=True)

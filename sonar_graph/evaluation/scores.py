@@ -28,6 +28,7 @@ from sonar_graph.evaluation.metrics import (
 )
 from sonar_graph.evaluation.own_map import LEAST_LANDMARKS, own_map_errors
 from sonar_graph.evaluation.results import ErrorSeries, Kind, RunResult, Score
+from sonar_graph.evaluation.tables import unaligned
 from sonar_graph.measurements import Ints
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import DetectionLog, LandmarkMap, Outcome, Trajectory
@@ -49,23 +50,23 @@ IN_TIME = (
 
 
 def trajectory_scores(
-    kind: Kind, estimate: Trajectory, truth: Trajectory, errors: ErrorSeries, instants: str
+    kind: Kind, estimate: Trajectory, truth: Trajectory, errors: ErrorSeries, instants: str, world: str
 ) -> dict[str, Score]:
     """Accuracy and consistency of one trajectory, under keys that begin with its kind.
 
-    Estimate, truth and errors are at the scored instants; ``instants`` has these in words, for the protocols. Scores
-    that need true orientations are left out where the truth has positions only.
+    Estimate, truth and errors are at the scored instants; ``instants`` has these in words, for the protocols, and
+    ``world`` is `unaligned`. Scores that need true orientations are left out where the truth has positions only.
     """
     which, over = ESTIMATES[kind], f"over {instants}, to which the truth is interpolated"
     fitted = "without scale (Umeyama 1991), fitted to these instants: rms of"
     rules = [
-        ("ate_raw_m", ate_raw_m(estimate, truth), "m", "not aligned: rms of 3-D position error"),
+        ("ate_raw_m", ate_raw_m(estimate, truth), "m", f"{world}: rms of 3-D position error"),
         ("ate_yaw_m", ate_yaw_m(estimate, truth), "m", f"aligned by yaw and translation {fitted} 3-D position error"),
         ("ate_se2_m", ate_se2_m(estimate, truth), "m", f"aligned by SE(2) {fitted} horizontal position error"),
         ("ate_se3_m", ate_se3_m(estimate, truth), "m", f"aligned by SE(3) {fitted} 3-D position error"),
-        ("yaw_rmse_rad", rmse(yaw_errors_rad(estimate, truth)), "rad", "not aligned: rms of wrapped heading error"),
+        ("yaw_rmse_rad", rmse(yaw_errors_rad(estimate, truth)), "rad", f"{world}: rms of wrapped heading error"),
         ("return_error_m", return_error_m(estimate, truth), "m",
-         "not aligned: norm of estimated minus true displacement from the first to the last,"),
+         f"{world}: norm of estimated minus true displacement from the first to the last,"),
     ]  # fmt: skip
     scores = _finite({key: Score(value, unit, f"{which}, {rule} {over}.") for key, value, unit, rule in rules})
     for delta_s in RELATIVE_DELTAS_S:
@@ -89,7 +90,7 @@ def trajectory_scores(
         if not math.isfinite(mean):
             continue
         protocol = (
-            f"{which}, not aligned: mean normalised squared error of {what} divided by {dof}, {over}, {known} of which "
+            f"{which}, {world}: mean normalised squared error of {what} divided by {dof}, {over}, {known} of which "
             f"have a covariance; 1 is consistent; {IN_TIME.format(samples)}."
         )
         scores[key] = Score(mean, "1", protocol, time_average_interval(samples, dof), better="inside")
@@ -114,7 +115,7 @@ def landmark_scores(estimated: LandmarkMap, sequence: Sequence) -> dict[str, Sco
     where = (
         "aligned, since without a true path the world of the landmarks is not that of the start"
         if is_aligned
-        else ("not aligned")
+        else unaligned(sequence)
     )
     dof = 2 * len(errors) - (3 if is_aligned else 0)
     scores = {
@@ -129,7 +130,7 @@ def landmark_scores(estimated: LandmarkMap, sequence: Sequence) -> dict[str, Sco
         ),
     }
     if not is_aligned:
-        raw = Score(rmse(errors.horizontal_m), "m", f"{which}, not aligned: rms of horizontal error.")
+        raw = Score(rmse(errors.horizontal_m), "m", f"{which}, {where}: rms of horizontal error.")
         scores = {"landmarks.raw_m": raw, **scores}
     return _finite(scores)
 

@@ -36,7 +36,6 @@ from sonar_graph.files import COMPARISON, read_json, regular, replacing, result_
 from sonar_graph.logs import Picture, write_landmarks_csv, write_result, write_tum
 from sonar_graph.logs.mcap import Attachment
 from sonar_graph.measurements import Dvl, Imu, LandmarkDetections
-from sonar_graph.recognition import PICTURE_FOLDER, RECOGNITION, read_recognition, write_recognition
 from sonar_graph.sequence import Sequence
 from sonar_graph.settings import parse
 from sonar_graph.states import DetectionLog, LandmarkMap, Outcome, Refusal, RefusedRow, Trajectory
@@ -48,6 +47,8 @@ FORMAT = "sonar_graph comparison 1"
 INDEX, SEQUENCE, RUNS = "comparison.json", "sequence.npz", "runs"
 RESULT, SERIES, RESULT_LOG = "result.json", "series.npz", "result.mcap"
 ENSEMBLES, PAGE = "ensembles.json", "report.html"
+RECOGNITION, PICTURE_FOLDER = "recognition.json", "recognised"
+"""As `sonar_graph.recognition` names them, which is loaded where something was recognised."""
 ESTIMATES = ("trajectory.tum", "causal.tum", "landmarks.csv")
 _SCORE, _TEXTS, _STATUS = TypeAdapter(Score), TypeAdapter(dict[str, str]), TypeAdapter(Literal["ok", "failed"])
 """Types of what people may have edited in ``comparison.json``."""
@@ -70,13 +71,26 @@ def write_comparison(comparison: Comparison, folder: Path) -> None:
     EvaluationError
         When an estimator's name cannot be the name of a folder; another command writes there; or a file would be
         replaced that this package did not write.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> from sonar_graph import compare
+    >>> from sonar_graph.evaluation import write_comparison
+    >>> from sonar_graph.testing import small_world
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_comparison(compare(small_world(), ["dead-reckoning"]), Path(folder))
+    ...     sorted(path.name for path in Path(folder).glob("[!.]*"))
+    ['comparison.json', 'runs', 'sequence.npz']
     """
     names = [run.estimator for run in comparison.runs]
     for name in names:
         if name in ("", ".", "..") or any(character in name for character in '/\\:*?"<>|'):
             raise EvaluationError(f"estimator name {name!r} cannot name a folder; install it under another name")
     with result_written(folder, COMPARISON) as written:
-        written.remove([INDEX, ENSEMBLES, PAGE, *(name for name in written.names if name.startswith(f"{RUNS}/"))])
+        earlier = (name for name in written.names if name.startswith((f"{RUNS}/", f"{PICTURE_FOLDER}/")))
+        written.remove([INDEX, ENSEMBLES, PAGE, RECOGNITION, *earlier])
         _write(comparison, folder)
 
 
@@ -97,7 +111,10 @@ def _write(comparison: Comparison, folder: Path) -> None:
             errors = comparison.errors[run.estimator]
             entry["errors"] = {kind: _error_summary(series) for kind, series in errors.items()}
         entries[run.estimator] = entry
-    write_recognition(comparison.recognition, folder)
+    if comparison.recognition is not None:
+        from sonar_graph.recognition import write_recognition
+
+        write_recognition(comparison.recognition, folder)
     if comparison.ensembles:
         write_json(folder / ENSEMBLES, {"ensembles": [asdict(one) for one in comparison.ensembles]})
     sequence, instants = comparison.sequence, comparison.instants_ns
@@ -197,6 +214,18 @@ def read_comparison(folder: Path) -> Comparison:
     ------
     EvaluationError
         When the folder holds no complete comparison, naming the file at fault.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> from sonar_graph import compare
+    >>> from sonar_graph.evaluation import read_comparison, write_comparison
+    >>> from sonar_graph.testing import small_world
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_comparison(compare(small_world(), ["dead-reckoning"]), Path(folder))
+    ...     [run.estimator for run in read_comparison(Path(folder)).runs]
+    ['dead-reckoning']
     """
     if not (folder / INDEX).is_file():
         raise EvaluationError(f"{folder}: no {INDEX} in it; it needs a folder that a comparison was written to")
@@ -224,6 +253,11 @@ def _restore(index: dict[str, Any], folder: Path) -> Comparison:
         if "errors" in entry:
             series = {kind: _unpack(f"errors.{kind}", ErrorSeries, arrays) for kind in KINDS}
             errors[name] = {kind: known for kind, known in series.items() if known is not None}
+    recognition = None
+    if (folder / RECOGNITION).is_file():
+        from sonar_graph.recognition import read_recognition
+
+        recognition = read_recognition(folder)
     arrays, entry = _read_arrays(folder / SEQUENCE), index["sequence"]
     several = read_json(folder / ENSEMBLES) if (folder / ENSEMBLES).is_file() else {"ensembles": []}
     calibration = parse(Calibration, entry["calibration"], str(folder / INDEX))
@@ -234,7 +268,7 @@ def _restore(index: dict[str, Any], folder: Path) -> Comparison:
         scores=scores,
         errors=errors,
         environment=_TEXTS.validate_python(index["environment"]),
-        recognition=read_recognition(folder),
+        recognition=recognition,
         ensembles=[Ensemble(**one) for one in several["ensembles"]],
     )
 

@@ -1,23 +1,19 @@
-"""The table of all results, and the scores of a comparison as one: metrics down, estimators across.
-
-Cells have a text for people and numbers for machines. Notebook, pages, CSV and LaTeX show the same `Table`.
-"""
+"""The scores of a comparison as tables: all of them, metrics down, estimators across; and those that are read first."""
 
 from __future__ import annotations
 
-import math
-import re
-from dataclasses import dataclass, field
-from html import escape
 from typing import TYPE_CHECKING
 
-from sonar_graph.evaluation.digits import ABSENT
+from sonar_graph.table import ABSENT, Cell, Column, Table, absent, number, words
 
 if TYPE_CHECKING:
     from sonar_graph.evaluation.results import Comparison, Score
+    from sonar_graph.sequence import Sequence
 
-RUN_COLOURS = 6
-"""Colours that a page has for runs; the next run begins anew."""
+FITTED = "truth.world"
+"""Note of a sequence whose truth was brought into the world of the estimates."""
+NOT_ALIGNED = "not aligned"
+
 TRAJECTORY_LABELS = {
     "ate_raw_m": "Position error, not aligned (ATE, RMS)",
     "ate_yaw_m": "Position error, yaw and translation aligned (ATE, RMS)",
@@ -66,150 +62,33 @@ BLOCKS = {
     "time": "Time",
     "memory": "Memory",
 }
+HEADLINES = {
+    "ate_se2_m": "RMS after SE(2) alignment",
+    "ate_se3_m": "RMS after SE(3) alignment",
+    "ate_yaw_m": "RMS after alignment of yaw and translation",
+    "ate_raw_m": "RMS, not aligned",
+}
+"""Position errors that can stand in the headline, best suited first, with their names there."""
+PAIRED = {"yaw_rmse_rad": "Yaw error", "nees_position": "Position NEES", "nees_yaw": "Yaw NEES"}
+"""Scores that the compact table has causal and smoothed, after the position error."""
+SINGLE = {
+    "causal.own_map_m": "On its own map",
+    "landmarks.se2_m": "Map error",
+    "time.update_median_ms": "Update, median",
+    "time.update_max_ms": "Update, longest",
+}
+"""Scores that the compact table has once."""
 DIRECTIONS = {"lower": "lower is better", "higher": "higher is better", "inside": "1 is consistent", "none": ""}
 
 
-@dataclass(frozen=True)
-class Column:
-    """One column; columns with the same ``over`` that follow each other share a heading above them."""
-
-    key: str
-    """Name in the CSV; more numbers of a cell are ``key_SUFFIX``."""
-    heading: str
-    over: str = ""
-    parts: tuple[str, ...] = ("",)
-    """Suffixes of the numbers in a cell."""
-    is_number: bool = True
-    run: int | None = None
-    """Index of the run that the column is about: the heading has its colour."""
-    warning: str = ""
-    """A word beside the heading."""
+def unaligned(sequence: Sequence) -> str:
+    """Words for scores and pictures in which no run is aligned; the truth may have been, once for all runs."""
+    return "the truth brought into the estimates' world" if FITTED in sequence.notes else NOT_ALIGNED
 
 
-@dataclass(frozen=True)
-class Cell:
-    """One value as people see it, with its numbers in the units of the results."""
-
-    text: str
-    numbers: tuple[float | str, ...] = ()
-    note: str = ""
-    link: str = ""
-    """Address within the page or beside it."""
-    run: int | None = None
-    """Index of the run that the cell names: it has its colour."""
-
-    @property
-    def sorting(self) -> float | str:
-        """The value by which rows are sorted; empty where there is none."""
-        value = self.numbers[0] if self.numbers else self.text
-        return value if value == value else ""
-
-
-@dataclass(frozen=True)
-class Table:
-    """One table of results."""
-
-    name: str
-    """Name of its files and on its page: letters, digits and hyphens."""
-    title: str
-    caption: str
-    columns: list[Column]
-    rows: list[list[Cell]] = field(default_factory=list)
-    sections: dict[int, str] = field(default_factory=dict)
-    """Headings between the rows, by the index of the row below."""
-
-    @property
-    def groups(self) -> list[tuple[str, int]]:
-        """Headings above the columns, each with the number of columns below it."""
-        found: list[tuple[str, int]] = []
-        for column in self.columns:
-            if found and found[-1][0] == column.over:
-                found[-1] = (column.over, found[-1][1] + 1)
-            else:
-                found.append((column.over, 1))
-        return found
-
-
-def words(text: str, link: str = "", run: int | None = None) -> Cell:
-    """A cell of text."""
-    return Cell(text, (text,), link=link, run=run)
-
-
-def count(value: int, note: str = "", link: str = "") -> Cell:
-    """A cell of a whole number."""
-    return Cell(str(value), (value,), note=note, link=link)
-
-
-def number(value: float, text: str, *others: float, note: str = "") -> Cell:
-    """A cell of a number and what belongs to it; a dash for NaN."""
-    return Cell(ABSENT if math.isnan(value) else text, (value, *others), note=note)
-
-
-def absent(parts: int = 1) -> Cell:
-    """A cell without a number."""
-    return Cell(ABSENT, (math.nan,) * parts)
-
-
-def text_table(name: str, title: str, headings: list[str], rows: list[list[str]], *, numbers: bool = True) -> Table:
-    """A table of texts: the first column of words, the others of numbers or of words too."""
-    columns = [Column(heading, heading, is_number=numbers and k > 0) for k, heading in enumerate(headings)]
-    return Table(name, title, "", columns, [[words(text) for text in row] for row in rows])
-
-
-def as_html(table: Table, *, is_sortable: bool = False) -> str:
-    """The table as a ``<table>`` element, all texts escaped.
-
-    In a sortable one headings are buttons and cells say their ``sorting``, for the script of a page.
-    """
-
-    def named(text: str, run: int | None) -> str:
-        if run is None:
-            return escape(text)
-        breakable = re.sub(r"([/=_,])", r"\1<wbr>", escape(text))
-        return f'<span class="run run-{run % RUN_COLOURS}">{breakable}</span>'
-
-    sortable, is_numeric = (' class="sortable"' if is_sortable else ""), ' class="number"'
-    lines = [f'<table{sortable} id="table-{escape(table.name)}">']
-    caption = f"{table.title}. {table.caption}" if table.caption else table.title
-    lines.append(f"<caption><span>{escape(caption)}</span></caption>")
-    lines.append("<thead>")
-    if len(table.groups) > 1:
-        over = (
-            f'<th scope="colgroup" colspan="{width}">{escape(heading)}</th>'
-            if heading
-            else f'<td colspan="{width}"></td>'
-            for heading, width in table.groups
-        )
-        lines.append(f'<tr class="over">{"".join(over)}</tr>')
-    lines.append("<tr>")
-    for column in table.columns:
-        heading = named(column.heading, column.run)
-        if column.warning:
-            heading += f' <span class="warning">{escape(column.warning)}</span>'
-        if is_sortable:
-            heading = f'<button type="button">{heading}</button>'
-        lines.append(f'<th scope="col"{is_numeric if column.is_number else ""}>{heading}</th>')
-    lines += ["</tr>", "</thead>", "<tbody>"]
-    for index, row in enumerate(table.rows):
-        if index in table.sections:
-            title = f'<th scope="rowgroup" colspan="{len(row)}"><span>{escape(table.sections[index])}</span></th>'
-            lines += ["</tbody>", "<tbody>"] if index else []
-            lines.append(f'<tr class="block">{title}</tr>')
-        lines.append("<tr>")
-        for place, (column, cell) in enumerate(zip(table.columns, row, strict=True)):
-            text = named(cell.text, cell.run)
-            if cell.link:
-                text = f'<a href="{escape(cell.link)}">{text}</a>'
-            if cell.note:
-                text += f' <span class="note">{escape(cell.note)}</span>'
-            tag, attributes = ("td", "") if place else ("th", ' scope="row"')
-            if column.is_number:
-                attributes += is_numeric
-            if is_sortable:
-                attributes += f' data-sort="{escape(str(cell.sorting))}"'
-            lines.append(f"<{tag}{attributes}>{text}</{tag}>")
-        lines.append("</tr>")
-    return "\n".join([*lines, "</tbody>", "</table>"])
+def label(metric: str, comparison: Comparison, labels: dict[str, str] = LABELS) -> str:
+    """Label of a score in a comparison, with what was brought where; ``labels``: or `HEADLINES`."""
+    return labels[metric].replace(NOT_ALIGNED, unaligned(comparison.sequence))
 
 
 def score_keys(comparison: Comparison) -> list[str]:
@@ -223,6 +102,44 @@ def score_keys(comparison: Comparison) -> list[str]:
     return sorted(
         keys, key=lambda key: (place(blocks, key.partition(".")[0]), place(metrics, key.partition(".")[2]), key)
     )
+
+
+def headline_metric(comparison: Comparison) -> str | None:
+    """The position error that most runs have, without its ``causal.`` or ``smoothed.``; None where no run has one."""
+    counts = {
+        metric: sum(comparison.score_of(run.estimator, f"causal.{metric}") is not None for run in comparison.runs)
+        for metric in HEADLINES
+    }
+    best = max(counts, key=lambda metric: counts[metric])
+    return best if counts[best] else None
+
+
+def compact_table(comparison: Comparison) -> Table:
+    """The scores that are read first: runs down, errors and NEES across, each causal and smoothed.
+
+    Columns that no run has are left out. Beside a NEES stands what the covariance is judged to be, where it misfits.
+    """
+    metric = headline_metric(comparison)
+    paired = ({metric: "Position error"} if metric else {}) | PAIRED
+    keys = {f"{kind}.{key}": (kind, label) for key, label in paired.items() for kind in ("causal", "smoothed")}
+    keys |= {key: (label, "") for key, label in SINGLE.items()}
+    columns, shown = [Column("estimator", "Estimator", is_number=False)], []
+    for key, (heading, over) in keys.items():
+        scores = [score for run in comparison.runs if (score := comparison.score_of(run.estimator, key))]
+        if scores:
+            unit = f" ({scores[0].shown_unit})" if scores[0].shown_unit else ""
+            columns.append(Column(key, heading if over else heading + unit, over + unit if over else ""))
+            shown.append(key)
+    rows = []
+    for index, run in enumerate(comparison.runs):
+        cells = [words(run.estimator, run=index)]
+        for key in shown:
+            found = comparison.score_of(run.estimator, key)
+            note = found.verdict if found is not None and found.verdict != "consistent" else ""
+            cells.append(absent() if found is None else number(found.value, found.text(), note=note))
+        rows.append(cells)
+    caption = f"Position error: {label(metric, comparison)}. NEES of a fitting covariance: 1." if metric else ""
+    return Table("compact", "Scores at a glance", caption, columns, rows)
 
 
 def run_columns(comparison: Comparison) -> list[Column]:
@@ -261,7 +178,14 @@ def score_table(comparison: Comparison) -> Table:
             cells.append(Cell(score.text(), (score.value,), note="; ".join(filter(None, [score.verdict, own]))))
         direction = DIRECTIONS[known[0].better]
         reading = f"{direction}; {common}" if direction and common else direction + common
-        rows.append([words(LABELS.get(metric, key)), words(known[0].shown_unit), *cells, words(reading)])
+        rows.append(
+            [
+                words(label(metric, comparison) if metric in LABELS else key),
+                words(known[0].shown_unit),
+                *cells,
+                words(reading),
+            ]
+        )
     return Table("scores", "Scores by metric and estimator", "", columns, rows, sections)
 
 

@@ -24,7 +24,7 @@ from sonar_graph.files.inputs import read_json, strict_json, text_of
 from sonar_graph.files.interrupts import deferred_interrupt
 
 MANIFEST, LOCK = ".sonar_graph.json", ".lock"
-COMPARISON, BATCH = "comparison", "batch"
+COMPARISON, BATCH, PAPER = "comparison", "batch", "paper"
 """Kinds of results in the manifests of folders."""
 FORMAT = "sonar_graph folder 1"
 DIGEST_DIGITS = 32

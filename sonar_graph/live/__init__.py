@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from sonar_graph.live.arrivals import Arrivals
     from sonar_graph.live.engine import Engine, LiveOptions
     from sonar_graph.live.live_messages import Message, dropped_messages, play_messages, recorded_messages
-    from sonar_graph.live.node import LiveRun, write_outcome
+    from sonar_graph.live.node import LiveRun
     from sonar_graph.live.outlets import open_link, open_outlets
     from sonar_graph.live.predictor import Prediction, Predictor
     from sonar_graph.live.zenoh_link import DEFAULT_ROUTER, Publisher, definition_of, open_session, subscribe
@@ -19,5 +19,5 @@ else:
 __all__ = [
     "Arrivals", "DEFAULT_ROUTER", "Engine", "LiveOptions", "LiveRun", "Message", "Prediction", "Predictor", "Publisher",
     "definition_of", "dropped_messages", "open_link", "open_outlets", "open_session", "play_messages",
-    "recorded_messages", "subscribe", "write_outcome",
+    "recorded_messages", "subscribe",
 ]

@@ -128,18 +128,20 @@ class Arrivals:
 
     def steps(self) -> Iterator[Measurements]:
         """Steps that are complete by now, in order."""
-        if self.start_ns is None:
+        begun_ns = self.start_ns if self.done_ns is None else self.done_ns
+        if begun_ns is None:
             return
-        end_ns = (self.start_ns if self.done_ns is None else self.done_ns) + self.step_ns
+        end_ns = begun_ns + self.step_ns
         while min(self.newest_ns.values()) >= end_ns or max(self.newest_ns.values()) >= end_ns + self.lateness_ns:
             yield self._step(end_ns)
             end_ns += self.step_ns
 
     def rest(self) -> Iterator[Measurements]:
         """Steps that are left when nothing more will come: up to the last instant with IMU and Doppler log."""
-        if self.start_ns is None:
+        begun_ns = self.start_ns if self.done_ns is None else self.done_ns
+        if begun_ns is None:
             return
-        end_ns = (self.start_ns if self.done_ns is None else self.done_ns) + self.step_ns
+        end_ns = begun_ns + self.step_ns
         while min(self.newest_ns[name] for name in MOTION) >= end_ns:
             yield self._step(end_ns)
             end_ns += self.step_ns

@@ -24,6 +24,7 @@ from sonar_graph.live.message_reader import MessageReader, Part
 from sonar_graph.logs import (
     LATENESS,
     LIVE_RATE,
+    ROLES,
     Assembly,
     Choice,
     LiveRecord,
@@ -57,7 +58,15 @@ class Counts:
 
 @dataclass
 class LiveOptions:
-    """Choices of a live run."""
+    """Choices of a live run.
+
+    Examples
+    --------
+    >>> from sonar_graph.live import LiveOptions
+    >>> options = LiveOptions(overrides={"history.policy": "bounded"}, lateness_s=0.5)
+    >>> options.estimator, options.rate_hz
+    ('isam2', 10.0)
+    """
 
     estimator: str = "isam2"
     overrides: Mapping[str, Any] = field(default_factory=dict)
@@ -81,6 +90,26 @@ class Engine:
         As of `Arrivals`.
     wanted, config, calibration
         Topics by role, description of topics, and fields of a calibration, as for `read_log`.
+
+    Examples
+    --------
+    The messages of a log, as they would come:
+
+    >>> from pathlib import Path
+    >>> from sonar_graph import write_log
+    >>> from sonar_graph.live import Engine, definition_of, recorded_messages
+    >>> from sonar_graph.logs import LiveRecord
+    >>> from sonar_graph.testing import small_world
+    >>> write_log("dive.mcap", small_world())
+    >>> steps = []
+    >>> with LiveRecord(Path("record.mcap")) as record:
+    ...     engine = Engine(record, definition_of, rate_hz=1.0)
+    ...     for message in recorded_messages(Path("dive.mcap")):
+    ...         parts = engine.take(message)
+    ...         steps += engine.steps()
+    ...     steps += engine.finish()
+    >>> len(steps)
+    20
     """
 
     def __init__(
@@ -216,9 +245,13 @@ class Engine:
         Its mounting is part of the calibration, which an estimator has from its beginning.
         """
         self._record.flush()
-        dropped = dropped_messages(self.record_path)
-        messages = [(message, message.arrival_ns) for message in recorded_messages(self.record_path)]
-        held = [(message, at_ns) for message, at_ns in messages if (message.topic, at_ns) not in dropped]
+        dropped, needed = dropped_messages(self.record_path), {*self.in_use.values(), *self._places}
+        held = [  # without images, which would not fit into memory
+            (message, message.arrival_ns)
+            for message in recorded_messages(self.record_path)
+            if (message.topic, message.arrival_ns) not in dropped
+            and (message.topic in needed or message.topic.endswith("tf_static"))
+        ]
         if not self._set_up(held):
             self._unfit.add(name)
             self.remarks.append(f"{name} is not used: {self.waits_for}")
@@ -252,6 +285,12 @@ class Engine:
             choices = choose_topics(recording, wanted, self._config)
         except MissingTopicError as error:  # it may still come
             self.waits_for = str(error)
+            return False
+        except LogError as error:  # several topics fit
+            if self._wanted.keys() - ROLES.keys():
+                raise
+            again = f"everything is recorded: end with Ctrl-C, and go on with --resume {self.record_path} and a choice"
+            self.waits_for = f"{error}; {again}"
             return False
         if unreadable := self._unreadable_detections(choices["detections"], held):
             held[:] = [one for one in held if one not in unreadable]

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sonar_graph.logs import DROPPED_TOPIC, dropped_in
-from sonar_graph.logs.mcap import ChunkPart, Keep, LogFile, Passage, Recording, scan
+from sonar_graph.logs.mcap import ChunkPart, Keep, LogFile, Passage, Recording, log_parts, scan
 
 LONGEST_SLEEP_S = 0.05
 HEAD = struct.Struct("<IQQ")
@@ -18,7 +18,14 @@ HEAD = struct.Struct("<IQQ")
 
 
 class Message(NamedTuple):
-    """A message as it came."""
+    """A message as it came.
+
+    Examples
+    --------
+    >>> from sonar_graph.live import Message
+    >>> Message("/imu", "sensor_msgs/msg/Imu", b"", arrival_ns=1_000_000_000).sequence
+    0
+    """
 
     topic: str
     type_name: str
@@ -36,11 +43,12 @@ def recorded_messages(path: Path) -> Iterator[Message]:
 
     Raises `LogError` when the file cannot be read, or is damaged in its middle.
     """
-    with LogFile(path) as file:
-        passage = Passage(file, lambda _: Keep.ALL, may_skip=False)
-        for _, parts in groupby(passage, key=lambda part: id(part.data)):
-            yield from _in_order(list(parts))
-        Recording(path, damage=passage.damage).require_sound()
+    for file_path in log_parts(path):
+        with LogFile(file_path) as file:
+            passage = Passage(file, lambda _: Keep.ALL, may_skip=False)
+            for _, parts in groupby(passage, key=lambda part: id(part.data)):
+                yield from _in_order(list(parts))
+            Recording(file_path, damage=passage.damage).require_sound()
 
 
 def _in_order(parts: list[ChunkPart]) -> Iterator[Message]:

@@ -10,19 +10,20 @@ only appends to it.
 
 from __future__ import annotations
 
-import threading
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
+from itertools import islice
 from textwrap import shorten
-from typing import Any, Self
+from typing import Self
 
 import gtsam
 import numpy as np
 
 from sonar_graph.errors import EstimatorError, LogError
+from sonar_graph.live.arrivals import MOTION
 from sonar_graph.live.engine import Engine, LiveOptions
+from sonar_graph.live.inbox import Inbox, Silence
 from sonar_graph.live.live_images import LiveImages
 from sonar_graph.live.live_messages import Message
 from sonar_graph.live.message_reader import Part
@@ -33,7 +34,6 @@ from sonar_graph.live.outlets import (
     Outlet,
     PoseForms,
     payload_of_detections,
-    payload_of_pose,
     payload_of_state,
     payloads_of_map,
 )
@@ -47,6 +47,8 @@ from sonar_graph.simulation import MissionOptions, simulate_mission
 from sonar_graph.states import Estimate
 
 FLUSH_S = 0.25
+FRAME_PERIOD_NS = 18_000_000
+"""Least time between two transforms of the body, some 50 a second: tf interpolates between them."""
 STATE_S = 1.0
 LINE_WIDTH = 200
 WAITING_S = 5.0
@@ -55,38 +57,9 @@ MOST_WAITING_S = 2.0
 """Time of steps that may wait for the estimator before the oldest lose their detections."""
 
 
+MOST_STEPS_AT_ONCE = 50
+MOST_DURATIONS = 20_000
 WARM_UP_S = 20.0
-
-
-class Inbox:
-    """Messages that wait to be taken, bounded: the oldest are dropped and counted."""
-
-    def __init__(self, most_bytes: int = 1 << 28) -> None:
-        self.dropped: Counter[str] = Counter()
-        self._messages: deque[Message] = deque()
-        self._bytes, self._most_bytes = 0, most_bytes
-        self._changed = threading.Condition()
-
-    def put(self, message: Message) -> None:
-        """Append a message."""
-        with self._changed:
-            self._messages.append(message)
-            self._bytes += len(message.payload)
-            while self._bytes > self._most_bytes:
-                oldest = self._messages.popleft()
-                self._bytes -= len(oldest.payload)
-                self.dropped[oldest.topic] += 1
-            self._changed.notify()
-
-    def take(self, timeout_s: float) -> list[Message]:
-        """All messages that wait; an empty list if none comes in time."""
-        with self._changed:
-            if not self._messages:
-                self._changed.wait(timeout_s)
-            messages = list(self._messages)
-            self._messages.clear()
-            self._bytes = 0
-            return messages
 
 
 class LiveRun:
@@ -123,13 +96,16 @@ class LiveRun:
             calibration=options.calibration,
         )
         self.predict_s: list[float] = []
-        """Durations of the newest predictions."""
+        """Durations of the newest predictions, by the wall clock."""
+        self.predict_cpu_s: list[float] = []
+        """The same by this thread's own time: what other threads and processes take meanwhile does not count."""
         self._record, self._options, self._outlets, self._said = record, options, outlets, said
         self._types = wanted_types(options.config or LogConfig(), ROLES)
         self._unused: set[str] = set()
         self._faulty: set[str] = set()
         self._forms = PoseForms()
         self._answers: deque[Answer] = deque()
+        self._images = LiveImages(self.engine, options)  # compiles in its process meanwhile
         warm_up = simulate_mission(MissionOptions(duration_s=WARM_UP_S))
         self._worker = Worker(
             options.estimator,
@@ -142,14 +118,18 @@ class LiveRun:
         )
         warm_predictor(warm_up)
         self._predictor: Predictor | None = None
-        self._images = LiveImages(self.engine, options)
+        self._silence = Silence()
         self._is_failed = False
         self._is_quiet = False  # while what an earlier run had is taken in: nobody waits for those poses
         self._generation = -1
         self._flushed_s = self._stated_s = time.monotonic()
         self._withheld: list[str] = []
-        self._latency_ns = self._estimates = self._newest_ns = 0
+        self._latency_ns = self._estimates = self._newest_ns = self._next_frame_ns = 0
         self._longest_update_s = 0.0
+
+    def wait_for_recogniser(self) -> None:
+        """Wait until landmarks can be recognised in images as soon as they come."""
+        self._images.wait()
 
     @property
     def images_waiting(self) -> int:
@@ -171,6 +151,8 @@ class LiveRun:
         for message in messages:
             last_ns = max(last_ns, message.arrival_ns)
             self._take(message, dropped.get((message.topic, message.arrival_ns)))
+            for step in self.engine.steps():
+                self._worker.add(step)
             while (self._worker.waiting or self._worker.is_busy) and self._worker.error is None:
                 time.sleep(1e-4)
             while self._answers:
@@ -201,8 +183,12 @@ class LiveRun:
 
     def turn(self, timeout_s: float = 0.05) -> None:
         """Take what has come, and send what follows from it."""
-        for message in self.inbox.take(timeout_s):
+        messages = self.inbox.take(timeout_s)
+        for message in messages:
+            self._silence.heard(message.topic, time.monotonic())
             self._take(message)
+        if not messages:
+            self._give_steps()
         while self._answers:
             self._use(self._answers.popleft())
         if failure := self._images.failure():
@@ -221,6 +207,9 @@ class LiveRun:
         if now_s > self._stated_s + STATE_S and self._predictor is not None:
             self._state()
             self._stated_s = now_s
+            motion = {topic for role, topic in self.engine.in_use.items() if role in MOTION}
+            for line in self._silence.lines(motion, now_s):
+                self._said(line)
         if self._worker.error is not None and not self._is_failed:
             self._is_failed = True
             self._said(f"{self._failure()}; everything is still recorded")
@@ -229,7 +218,8 @@ class LiveRun:
         """LiveOutcome when no more messages will come; None where nothing could be estimated."""
         for message in self.inbox.take(0.0):
             self._take(message)
-        for step in self.engine.finish():
+        self._images.finish()
+        for step in (*self.engine.steps(), *self.engine.finish()):
             self._worker.add(step)
         if self._predictor is None:
             return None
@@ -275,7 +265,11 @@ class LiveRun:
             self._move_on(parts, message.arrival_ns)
         except Exception as error:  # only the pose at the rate of the IMU suffers
             self._fault("the prediction", error)
-        for step in self.engine.steps():
+        self._give_steps()
+
+    def _give_steps(self) -> None:
+        """Give steps to the estimator, so few at once that no pose waits; a clock that was set may complete many."""
+        for step in islice(self.engine.steps(), MOST_STEPS_AT_ONCE):
             self._worker.add(step)
 
     def _move_on(self, parts: list[Part], arrival_ns: int) -> None:
@@ -307,19 +301,22 @@ class LiveRun:
                 self._said(f"warning: {warning}")
         self._worker.begin(calibration)
         self._predictor = Predictor(calibration)
-        self._newest_ns = 0
+        self._newest_ns = self._next_frame_ns = 0
         self._said(f"estimating by {options.estimator}; Ctrl-C ends")
 
     def _predict(self, arrival_ns: int) -> None:
         assert self._predictor is not None
-        before_s = time.perf_counter()
+        before_s, before_cpu_s = time.perf_counter(), time.thread_time()
         at = self._predictor.predict()
         if at is None or at.stamp_ns <= self._newest_ns:
             return
+        self.predict_cpu_s.append(time.thread_time() - before_cpu_s)
         self.predict_s.append(time.perf_counter() - before_s)
         self._newest_ns = at.stamp_ns
         self._put("/sonar_graph/odometry", self._forms.odometry(at))
-        self._put("/tf", self._forms.body(at))
+        if at.stamp_ns >= self._next_frame_ns:
+            self._next_frame_ns = at.stamp_ns + FRAME_PERIOD_NS
+            self._put("/tf", self._forms.body(at))
         self._latency_ns = max(self._latency_ns, time.time_ns() - arrival_ns)
 
     def _use(self, answer: Answer) -> None:
@@ -328,7 +325,7 @@ class LiveRun:
         self._longest_update_s = max(self._longest_update_s, answer.update_s)
         self._estimates += len(answer.estimates)
         for estimate in answer.estimates:
-            self._put("/sonar_graph/pose", payload_of_pose(estimate))
+            self._put("/sonar_graph/pose", self._forms.estimate(estimate))
         if answer.estimates:
             newest = answer.estimates[-1]
             self._predictor.correct(newest)
@@ -345,6 +342,7 @@ class LiveRun:
             "latency_ms": f"{self._latency_ns * 1e-6:.1f}",
             "longest_update_ms": f"{self._longest_update_s * 1e3:.1f}",
             "predictor_p99_us": f"{1e6 * np.percentile(self.predict_s or [np.nan], 99):.0f}",
+            "predictor_cpu_p99_us": f"{1e6 * np.percentile(self.predict_cpu_s or [np.nan], 99):.0f}",
             "steps_waiting": str(self._worker.waiting),
             "images_waiting": str(self.images_waiting),
             "estimates": str(self._estimates),
@@ -356,7 +354,7 @@ class LiveRun:
         summary = "running" if is_well else "messages are lost, dropped or withheld"
         self._put("/sonar_graph/state", payload_of_state(self._newest_ns, is_well, summary, values))
         self._latency_ns, self._longest_update_s = 0, 0.0
-        del self.predict_s[: -20 * 1000]
+        del self.predict_s[:-MOST_DURATIONS], self.predict_cpu_s[:-MOST_DURATIONS]
 
     def _put(self, topic: str, payload: bytes) -> None:
         for outlet in self._outlets:
@@ -364,22 +362,12 @@ class LiveRun:
 
 
 def warm_predictor(world: Sequence) -> None:
-    """Compile what a predictor needs."""
-    predictor = Predictor(world.calibration)
-    for step in world.replay(world.instants(1.0)):
-        predictor.add(step.imu, step.dvl)
-        predictor.correct(Estimate(step.end_ns, gtsam.Pose3(), np.eye(6)))
-        predictor.predict()
-
-
-def write_outcome(folder: Path, name: str, outcome: LiveOutcome, counts: Mapping[str, Any]) -> None:
-    """Trajectories and landmarks of a live run, named as `sonar-graph run` names them, and ``live.json``."""
-    from sonar_graph.files import write_json
-    from sonar_graph.logs import write_landmarks_csv, write_tum
-
-    write_json(folder / "live.json", {"estimator": name, "messages": counts})
-    place = folder / "runs" / name
-    place.mkdir(parents=True, exist_ok=True)
-    write_tum(place / "causal.tum", outcome.causal)
-    write_tum(place / "trajectory.tum", outcome.smoothed)
-    write_landmarks_csv(place / "landmarks.csv", outcome.landmarks)
+    """Compile what predictions and their messages need, over a gap of the Doppler log too."""
+    predictor, forms = Predictor(world.calibration), PoseForms()
+    for k, step in enumerate(world.replay(world.instants(1.0))):
+        predictor.add(step.imu, None if 10 < k < 15 else step.dvl)
+        if k < 10:
+            predictor.correct(Estimate(step.end_ns, gtsam.Pose3(), np.eye(6)))
+        if (at := predictor.predict()) is not None:
+            forms.odometry(at)
+            forms.body(at)

@@ -2,7 +2,7 @@
 
 =========================  ===================================================================================
 ``/sonar_graph/odometry``  ``nav_msgs/Odometry`` in ``map`` at the rate of the IMU, with covariance and velocity
-``/tf``                    ``map`` to ``odom`` (jumps) and ``odom`` to ``base_link`` (smooth), as REP-105 has them
+``/tf``                    ``map`` to ``odom`` (jumps), ``odom`` to ``base_link`` (smooth, 50 a second): REP-105
 ``/sonar_graph/pose``      ``geometry_msgs/PoseWithCovarianceStamped``: the estimates themselves
 ``/sonar_graph/landmarks`` ``sonar_graph_msgs/LandmarkMap``
 ``/sonar_graph/markers``   ``visualization_msgs/MarkerArray``: the same for viewers, 95 % ellipsoids
@@ -13,21 +13,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
+from functools import partial
+from struct import Struct
 from typing import Any, Protocol
 
-import gtsam
 import numpy as np
 
 from sonar_graph.errors import LogError
 from sonar_graph.live.foxglove_link import FoxgloveLink
 from sonar_graph.live.predictor import Prediction
 from sonar_graph.live.zenoh_link import Publisher, ZenohLink
-from sonar_graph.logs import detection_messages, landmark_map_message, landmark_markers, pose_messages
-from sonar_graph.logs.adapters import body_to_ros
-from sonar_graph.logs.cdr import Bytes, Decoder, Messages, definition, encode, parse_definition
-from sonar_graph.measurements import NS_PER_S, LandmarkDetections
-from sonar_graph.states import Estimate, LandmarkMap, Trajectory
+from sonar_graph.logs import detection_messages, landmark_map_message, landmark_markers
+from sonar_graph.logs.cdr import Decoder, definition, encode, parse_definition
+from sonar_graph.measurements import NS_PER_S, Floats, LandmarkDetections
+from sonar_graph.numerics import Mat6, compiled, mat, mat6, quaternion, store6
+from sonar_graph.states import Estimate, LandmarkMap
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 TF = "tf2_msgs/msg/TFMessage"
@@ -61,29 +63,37 @@ class Form:
 
     def __init__(self, type_name: str, values: Mapping[str, Any], lengths: Mapping[str, int] | None = None) -> None:
         struct = parse_definition(type_name, definition(type_name))
-        self.bytes: Bytes = encode(struct, 1, values, lengths)
-        (messages,) = Decoder(struct).decode([(np.zeros(1, np.int64), self.bytes)]).groups
-        self._messages: Messages = messages
-        self._views: dict[str, Any] = {}
+        encoded = encode(struct, 1, values, lengths)
+        (messages,) = Decoder(struct).decode([(np.zeros(1, np.int64), encoded)]).groups
+        self._bytes, self._layout = bytearray(encoded.tobytes()), messages.layout
 
-    def __setitem__(self, path: str, value: Any) -> None:
-        view = self._views.get(path)
-        if view is None:
-            view = self._views[path] = self._messages[path]
-            assert np.shares_memory(view, self.bytes)
-        view[...] = value
+    def stamp(self, path: str) -> Callable[[int, int], None]:
+        """Function that writes seconds and nanoseconds of the stamp that is there."""
+        return partial(Struct("<iI").pack_into, self._bytes, self._layout.column(path).starts[0])
 
+    def numbers(self, path: str, count: int) -> Floats:
+        """Successive numbers from a field on, in place, shape (count,)."""
+        return np.frombuffer(self._bytes, "<f8", count, self._layout.column(path).starts[0])
 
-def quaternion_xyzw(pose: gtsam.Pose3) -> tuple[float, float, float, float]:
-    """Quaternion of a pose, scalar last."""
-    q: Any = pose.rotation().toQuaternion()
-    return q.x(), q.y(), q.z(), q.w()
+    def payload(self) -> bytes:
+        """The message as it is now."""
+        return bytes(self._bytes)
 
 
-def payload_of_pose(estimate: Estimate) -> bytes:
-    """``PoseWithCovarianceStamped`` of an estimate."""
-    entry = pose_messages("", Trajectory.from_estimates([estimate]))
-    return entry.payloads[0].tobytes()
+@compiled
+def write_pose(world_T_body: Floats, place: Floats) -> None:
+    """Fill in position and quaternion, scalar last, shape (7,)."""
+    v, w = quaternion(mat(world_T_body))
+    scale = 1.0 / math.sqrt(v @ v + w * w)
+    place[0], place[1], place[2] = world_T_body[0, 3], world_T_body[1, 3], world_T_body[2, 3]
+    place[3], place[4], place[5], place[6] = scale * v.x, scale * v.y, scale * v.z, scale * w
+
+
+@compiled
+def write_covariance(world_T_body: Floats, covariance: Floats, out: Floats) -> None:
+    """Fill in the covariance as `body_to_ros` has it: of [position, rotation] along the world's axes, shape (6, 6)."""
+    R, P = mat(world_T_body), mat6(covariance)
+    store6(Mat6(R @ P.d @ R.T, R @ P.c @ R.T, R @ P.b @ R.T, R @ P.a @ R.T), out)
 
 
 def payload_of_detections(detections: LandmarkDetections | None, stamp_ns: int) -> bytes:
@@ -101,49 +111,68 @@ def payloads_of_map(landmarks: LandmarkMap, stamp_ns: int) -> tuple[bytes, bytes
     return landmark_map_message("", landmarks, stamp_ns).payloads[0].tobytes(), markers.payloads[0].tobytes()
 
 
+class PoseForm(Form):
+    """A message with a stamp, a pose and its covariance."""
+
+    def __init__(self, type_name: str, values: Mapping[str, Any]) -> None:
+        super().__init__(type_name, {"header.frame_id": WORLD_FRAME, **values})
+        self._stamp = self.stamp("header.stamp.sec")
+        self._in_message, self._numbers = self.numbers("pose.pose.position.x", 43), np.empty(43)
+        self._place, self._covariance = self._numbers[:7], self._numbers[7:].reshape(6, 6)
+
+    def write(self, stamp_ns: int, world_T_body: Floats, covariance: Floats) -> None:
+        """Write them; the covariance is known."""
+        write_pose(world_T_body, self._place)
+        write_covariance(world_T_body, covariance, self._covariance)
+        self._stamp(*divmod(stamp_ns, NS_PER_S))
+        self._in_message[:] = self._numbers  # which numbers of a message are not aligned for
+
+
+class FrameForm(Form):
+    """``tf2_msgs/TFMessage`` of one frame in another."""
+
+    def __init__(self, parent: str, child: str) -> None:
+        names = {"transforms.header.frame_id": parent, "transforms.child_frame_id": child}
+        super().__init__(TF, names, {"transforms": 1})
+        self._stamp = self.stamp("transforms.header.stamp.sec")
+        self._in_message, self._place = self.numbers("transforms.transform.translation.x", 7), np.empty(7)
+
+    def of(self, stamp_ns: int, pose: Floats) -> bytes:
+        """The message at a stamp."""
+        write_pose(pose, self._place)
+        self._stamp(*divmod(stamp_ns, NS_PER_S))
+        self._in_message[:] = self._place
+        return self.payload()
+
+
 class PoseForms:
-    """Messages of predictions."""
+    """Messages of predictions and estimates."""
 
     def __init__(self) -> None:
-        self._odometry = Form(ODOMETRY, {"header.frame_id": WORLD_FRAME, "child_frame_id": BODY_FRAME})
-        self._frames = [
-            Form(
-                TF,
-                {"transforms.header.frame_id": parent, "transforms.child_frame_id": child},
-                {"transforms": 1},
-            )
-            for parent, child in ((WORLD_FRAME, ODOM_FRAME), (ODOM_FRAME, BODY_FRAME))
-        ]
+        self._odometry = PoseForm(ODOMETRY, {"child_frame_id": BODY_FRAME})
+        self._velocity = self._odometry.numbers("twist.twist.linear.x", 3)
+        self._estimate = PoseForm(TOPICS["/sonar_graph/pose"], {})
+        self._correction, self._body = FrameForm(WORLD_FRAME, ODOM_FRAME), FrameForm(ODOM_FRAME, BODY_FRAME)
 
     def odometry(self, at: Prediction) -> bytes:
         """``nav_msgs/Odometry``."""
-        R = at.world_T_body.rotation().matrix()
-        form = self._odometry
-        form["header.stamp.sec"], form["header.stamp.nanosec"] = divmod(at.stamp_ns, NS_PER_S)
-        numbers = [*at.world_T_body.translation(), *quaternion_xyzw(at.world_T_body)]
-        for path, value in zip(_POSE, numbers, strict=True):
-            form[path] = value
-        form["pose.covariance"] = body_to_ros(at.covariance[None], R[None]).reshape(36)
-        for axis, value in zip("xyz", at.velocity_m_s, strict=True):
-            form[f"twist.twist.linear.{axis}"] = value
-        return form.bytes.tobytes()
+        self._odometry.write(at.stamp_ns, at.world_T_body, at.covariance)
+        self._velocity[:] = at.velocity_m_s
+        return self._odometry.payload()
 
-    def correction(self, stamp_ns: int, map_T_odom: gtsam.Pose3) -> bytes:
+    def estimate(self, at: Estimate) -> bytes:
+        """``PoseWithCovarianceStamped``; zeros in place of a covariance that is not known."""
+        covariance = np.ascontiguousarray(np.nan_to_num(at.covariance, nan=0.0))
+        self._estimate.write(at.stamp_ns, np.ascontiguousarray(at.world_T_body.matrix()), covariance)
+        return self._estimate.payload()
+
+    def correction(self, stamp_ns: int, map_T_odom: Floats) -> bytes:
         """``tf2_msgs/TFMessage`` of ``odom`` in ``map``."""
-        return _frame(self._frames[0], stamp_ns, map_T_odom)
+        return self._correction.of(stamp_ns, map_T_odom)
 
     def body(self, at: Prediction) -> bytes:
         """``tf2_msgs/TFMessage`` of the body in ``odom``."""
-        return _frame(self._frames[1], at.stamp_ns, at.odom_T_body)
-
-
-def _frame(form: Form, stamp_ns: int, pose: gtsam.Pose3) -> bytes:
-    form["transforms.header.stamp.sec"], form["transforms.header.stamp.nanosec"] = divmod(stamp_ns, NS_PER_S)
-    for axis, value in zip("xyz", pose.translation(), strict=True):
-        form[f"transforms.transform.translation.{axis}"] = value
-    for axis, value in zip("xyzw", quaternion_xyzw(pose), strict=True):
-        form[f"transforms.transform.rotation.{axis}"] = value
-    return form.bytes.tobytes()
+        return self._body.of(at.stamp_ns, at.odom_T_body)
 
 
 def payload_of_state(stamp_ns: int, is_well: bool, summary: str, values: Mapping[str, str]) -> bytes:
@@ -156,14 +185,13 @@ def payload_of_state(stamp_ns: int, is_well: bool, summary: str, values: Mapping
     return encode(struct, 1, said, {"status": 1, "status.values": len(values)})[0].tobytes()
 
 
-_POSE = [f"pose.pose.position.{axis}" for axis in "xyz"] + [f"pose.pose.orientation.{axis}" for axis in "xyzw"]
-
-
 class ZenohOutlet:
     """Topics of ROS 2 over zenoh."""
 
     def __init__(self, session: Any, domain: int) -> None:
-        self._publishers = {topic: Publisher(session, domain, topic, kind) for topic, kind in TOPICS.items()}
+        self._publishers = {
+            topic: Publisher(session, domain, topic, kind, may_drop=True) for topic, kind in TOPICS.items()
+        }
 
     def put(self, topic: str, payload: bytes) -> None:
         """Send one message."""

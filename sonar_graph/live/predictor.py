@@ -15,7 +15,7 @@ import numpy as np
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Dvl, Floats, Imu
-from sonar_graph.navigation import Odometry
+from sonar_graph.navigation import MovedPoses, Odometry
 from sonar_graph.states import Estimate
 
 BIAS = np.zeros(3)
@@ -23,13 +23,23 @@ BIAS = np.zeros(3)
 
 
 class Prediction(NamedTuple):
-    """Pose at an instant."""
+    """Poses at an instant, as matrices, of which `gtsam.Pose3` would take longer to make than the prediction.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sonar_graph.live import Prediction
+    >>> Prediction(0, np.eye(4), np.eye(6), np.eye(4), np.zeros(3)).velocity_m_s.shape
+    (3,)
+    """
 
     stamp_ns: int
-    world_T_body: gtsam.Pose3
+    world_T_body: Floats
+    """Shape (4, 4)."""
     covariance: Floats
     """Of the body-frame perturbation [rotation, translation], shape (6, 6)."""
-    odom_T_body: gtsam.Pose3
+    odom_T_body: Floats
+    """Shape (4, 4)."""
     velocity_m_s: Floats
     """Of the IMU's point at the newest epoch, body axes, shape (3,)."""
 
@@ -55,15 +65,15 @@ class Predictor:
 
     def __init__(self, calibration: Calibration) -> None:
         self._odometry = Odometry(calibration)
+        self._poses = MovedPoses(self._odometry)
         self._estimate: Estimate | None = None
         self._odom_T_estimate = gtsam.Pose3()
         self._newest_ns = 0
-        self._velocity = np.zeros(3)
-        self._epoch_ns: int | None = None
 
     def add(self, imu: Imu | None, dvl: Dvl | None) -> None:
         """Take in rows as they come."""
-        self._odometry.add(imu, dvl)
+        if self._odometry.add(imu, dvl):
+            self._poses.sum_anew()
         if imu is not None:
             self._newest_ns = max(self._newest_ns, int(imu.stamps_ns[-1]))
 
@@ -76,30 +86,21 @@ class Predictor:
             step = self._odometry.motion(before.stamp_ns, estimate.stamp_ns, BIAS, known_ns=self._newest_ns)
             self._odom_T_estimate = self._odom_T_estimate.compose(step.i_T_j)
         self._estimate = estimate
+        in_both = np.array([estimate.world_T_body.matrix(), self._odom_T_estimate.matrix()])
+        self._poses.begin(estimate.stamp_ns, in_both, estimate.covariance)
         self._odometry.forget_before(estimate.stamp_ns)
 
     @property
-    def map_T_odom(self) -> gtsam.Pose3:
-        """Correction of the smooth frame by the newest estimate."""
+    def map_T_odom(self) -> Floats:
+        """Correction of the smooth frame by the newest estimate, shape (4, 4)."""
         assert self._estimate is not None
-        return self._estimate.world_T_body.compose(self._odom_T_estimate.inverse())
+        correction = self._estimate.world_T_body.compose(self._odom_T_estimate.inverse())
+        return np.ascontiguousarray(correction.matrix())
 
     def predict(self) -> Prediction | None:
-        """Pose at the newest IMU row; None before the first estimate."""
-        at, newest_ns = self._estimate, self._newest_ns
-        if at is None:
+        """Poses at the newest IMU row; None before the first estimate."""
+        if self._estimate is None:
             return None
-        newest_ns = max(newest_ns, at.stamp_ns)
-        motion = self._odometry.motion(at.stamp_ns, newest_ns, BIAS)
-        A = motion.i_T_j.inverse().AdjointMap()
-        epochs_ns = self._odometry.epochs(newest_ns - 1_000_000_000, newest_ns)
-        if len(epochs_ns) and epochs_ns[-1] != self._epoch_ns:
-            self._epoch_ns = int(epochs_ns[-1])
-            self._velocity, _ = self._odometry.velocity_at_imu(self._epoch_ns)
-        return Prediction(
-            newest_ns,
-            at.world_T_body.compose(motion.i_T_j),
-            A @ at.covariance @ A.T + motion.covariance,
-            self._odom_T_estimate.compose(motion.i_T_j),
-            self._velocity,
-        )
+        newest_ns = max(self._newest_ns, self._estimate.stamp_ns)
+        (world_T_body, odom_T_body), covariance, velocity = self._poses.at(newest_ns)
+        return Prediction(newest_ns, world_T_body, covariance, odom_T_body, velocity)

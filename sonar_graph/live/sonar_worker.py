@@ -6,19 +6,32 @@ come faster than they are recognised, the oldest that wait are dropped, and the 
 
 from __future__ import annotations
 
+import gc
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from sonar_graph.files import READY, OwnProcess, Tell, serve
 from sonar_graph.images import SonarFrames
 from sonar_graph.measurements import Depth, Dvl, Imu, LandmarkDetections
 from sonar_graph.sequence import Sequence
+from sonar_graph.simulation import MissionOptions, simulate_mission
 
+WARM_UP = "warm up"
+BEAMS, BINS = 96, 512
 MOST_FRAMES = 5
 """Number of images that may wait."""
 OVERTAKEN = "overload: newer images came before it was recognised"
+
+
+class SonarBegin(NamedTuple):
+    """Request to begin with the calibration and the rows of the first seconds, and images with the form of one."""
+
+    sequence: Sequence
+    frame: SonarFrames
 
 
 @dataclass(frozen=True)
@@ -52,16 +65,36 @@ class _Recogniser:
     session: Any
 
 
+def warm_recogniser() -> None:
+    """Compile what a recogniser needs, on images of noise with a bright spot that moves."""
+    from sonar_graph.recognition import RecognitionSession
+
+    world, noise = simulate_mission(MissionOptions(duration_s=6.0)), np.random.default_rng(0)
+    session = RecognitionSession(world, pictures=False)
+    ranges_m, azimuths_rad = np.linspace(0.5, 10.0, BINS), np.linspace(1.0, -1.0, BEAMS)
+    for k, stamp_ns in enumerate(world.instants(4.0)[2:]):
+        intensity = noise.integers(0, 40, (1, BEAMS, BINS)).astype(np.uint8)
+        intensity[0, 40 + k : 46 + k, 200:220] = 250
+        session.take(SonarFrames(np.array([stamp_ns]), intensity, ranges_m, azimuths_rad))
+
+
 def serve_recogniser() -> None:
     """Answer requests until stdin ends."""
     serve(_answer)
 
 
 def _answer(request: Any, tell: Tell) -> object:  # noqa: ARG001  # of `serve`
-    if isinstance(request, Sequence):
+    if request == WARM_UP:
+        warm_recogniser()
+        return READY
+    if isinstance(request, SonarBegin):
         from sonar_graph.recognition import RecognitionSession  # loads numba
+        from sonar_graph.sonar import Recogniser
 
-        _Recogniser.session = RecognitionSession(request, pictures=False)
+        recogniser = Recogniser(request.sequence.calibration)
+        recogniser.prepare(request.frame)
+        _Recogniser.session = RecognitionSession(request.sequence, recogniser=recogniser, pictures=False)
+        gc.freeze()  # templates are never looked at again, which would delay an image
         return READY
     session = _Recogniser.session
     session.extend(request.imu, request.dvl, request.depth)
@@ -78,22 +111,32 @@ class SonarWorker:
 
     Parameters
     ----------
-    sequence
-        Calibration, and the rows of the first seconds.
     seen
         Called with each `SonarAnswer`, by a thread of the worker.
     """
 
-    def __init__(self, sequence: Sequence, seen: Callable[[SonarAnswer], None]) -> None:
+    def __init__(self, seen: Callable[[SonarAnswer], None]) -> None:
         self._process = OwnProcess(
             ("-c", "from sonar_graph.live.sonar_worker import serve_recogniser; serve_recogniser()")
         )
         self._seen = seen
         self._waiting: list[Waiting] = []
         self._changed = threading.Condition()
+        self._begin: SonarBegin | None = None
+        self._is_ended = False
+        self.is_warm = threading.Event()
+        """Set when it has compiled what it needs, or failed."""
+        self.has_begun = threading.Event()
+        """Set when it has drawn what it compares images with, or failed."""
         self.error: Exception | None = None
         """Why recognition failed, if it did."""
-        threading.Thread(target=self._work, args=(sequence,), daemon=True).start()
+        threading.Thread(target=self._work, daemon=True).start()
+
+    def begin(self, begin: SonarBegin) -> None:
+        """Begin; images are given when it has begun."""
+        with self._changed:
+            self._begin = begin
+            self._changed.notify()
 
     def add(self, waiting: Waiting) -> list[Waiting]:
         """Queue an image with the rows before it; those that are dropped, whose rows go with the next."""
@@ -110,21 +153,40 @@ class SonarWorker:
 
     def end(self) -> None:
         """End the process."""
-        self._process.end()
+        with self._changed:
+            was_ended, self._is_ended = self._is_ended, True
+            self._changed.notify()
+        if not was_ended:
+            self._process.end()
 
-    def _work(self, sequence: Sequence) -> None:
+    def _work(self) -> None:
         try:
             self._process.answer()  # that it is ready
-            self._process.send(sequence)
-            self._process.answer()
+            self._ask(WARM_UP)
+            self.is_warm.set()
+            with self._changed:
+                while self._begin is None and not self._is_ended:
+                    self._changed.wait()
+            if self._begin is None:
+                return
+            self._ask(self._begin)
+            self.has_begun.set()
             while True:
                 with self._changed:
-                    while not self._waiting:
+                    while not self._waiting and not self._is_ended:
                         self._changed.wait()
+                    if self._is_ended:
+                        return
                     one = self._waiting.pop(0)
-                self._process.send(one.rows)
-                answer = self._process.answer()
+                answer = self._ask(one.rows)
                 if isinstance(answer, SonarAnswer):
                     self._seen(answer)
         except Exception as error:  # of the process, or because it was ended
             self.error = error
+        finally:
+            self.is_warm.set()
+            self.has_begun.set()
+
+    def _ask(self, request: object) -> Any:
+        self._process.send(request)
+        return self._process.answer()

@@ -55,6 +55,11 @@ class LiveOutcome:
     smoothed: Trajectory
     landmarks: LandmarkMap
     refused: list[RefusedRow]
+    withheld: list[str]
+    update_s: list[float]
+    """Duration of each update."""
+    finish_s: float
+    """Duration of asking for all of this."""
 
 
 FINISH = "finish"
@@ -65,6 +70,7 @@ class _Served:
 
     estimator: Estimator
     estimates: list[Estimate]
+    update_s: list[float]
     next_map_s = 0.0
 
 
@@ -80,19 +86,21 @@ def _answer(request: Any, tell: Tell) -> object:  # noqa: ARG001  # of `serve`
         kind = load_estimator(request.name)
         params = make_params(kind, request.overrides, request.name)
         _Served.estimator = kind(request.calibration, Odometry(request.calibration), params)
-        _Served.estimates, _Served.next_map_s = [], 0.0
+        _Served.estimates, _Served.update_s, _Served.next_map_s = [], [], 0.0
         return READY
     estimator = _Served.estimator
     if request == FINISH:
+        before_s = time.perf_counter()
         smoothed, landmarks = estimator.trajectory(), estimator.landmarks()
-        return LiveOutcome(
-            Trajectory.from_estimates(_Served.estimates), smoothed, landmarks, refused_rows_of(estimator)
-        )
+        finish_s = time.perf_counter() - before_s
+        causal, refused = Trajectory.from_estimates(_Served.estimates), refused_rows_of(estimator)
+        return LiveOutcome(causal, smoothed, landmarks, refused, withheld_of(estimator), _Served.update_s, finish_s)
     found, longest_s, landmarks_now = [], 0.0, None
     for step in request:
         before_s = time.perf_counter()
         estimate = estimator.process(step)
-        longest_s = max(longest_s, time.perf_counter() - before_s)
+        _Served.update_s.append(time.perf_counter() - before_s)
+        longest_s = max(longest_s, _Served.update_s[-1])
         if estimate is not None:
             found.append(estimate)
     _Served.estimates += found

@@ -32,6 +32,7 @@ def topic_key(domain: int, topic: str, type_name: str, type_hash: str) -> str:
     return f"{domain}/{topic.strip('/')}/{package}::msg::dds_::{name}_/{type_hash}"
 
 
+@lru_cache(maxsize=1024)
 def parse_key(key: str) -> tuple[str, str] | None:
     """Topic and type of a key; None for what is no topic of ROS 2."""
     _, _, rest = key.partition("/")
@@ -155,23 +156,26 @@ def subscribe(
 
 
 class Publisher:
-    """Publisher of one topic."""
+    """Publisher of one topic.
 
-    def __init__(self, session: Any, domain: int, topic: str, type_name: str) -> None:
+    ``may_drop``: a subscriber that stalls misses messages, instead of holding up everybody.
+    """
+
+    def __init__(self, session: Any, domain: int, topic: str, type_name: str, *, may_drop: bool = False) -> None:
         import zenoh.ext
 
         key = topic_key(domain, topic, type_name, type_hash(type_name))
-        block = zenoh.CongestionControl.BLOCK
+        control = zenoh.CongestionControl.DROP if may_drop else zenoh.CongestionControl.BLOCK
         if topic.endswith("_static"):  # for subscribers that come later
             self._publisher: Any = zenoh.ext.declare_advanced_publisher(
                 session,
                 key,
-                congestion_control=block,
+                congestion_control=control,
                 cache=zenoh.ext.CacheConfig(max_samples=1),
                 publisher_detection=True,
             )
         else:
-            self._publisher = session.declare_publisher(key, congestion_control=block, express=True)
+            self._publisher = session.declare_publisher(key, congestion_control=control, express=True)
         self._sender = os.urandom(16)
         self._sequence = 0
 

@@ -7,6 +7,7 @@ import heapq
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
@@ -22,7 +23,19 @@ from mcap.writer import Writer
 from sonar_graph.errors import LogError
 from sonar_graph.files import written_whole
 from sonar_graph.logs.cdr import definition, short_name
-from sonar_graph.logs.mcap import LIBRARY, ChunkPart, Keep, LogFile, Outgoing, Passage, Recording, parse, seal
+from sonar_graph.logs.mcap import (
+    LIBRARY,
+    ChunkPart,
+    Damage,
+    Keep,
+    LogFile,
+    Outgoing,
+    Passage,
+    Recording,
+    log_parts,
+    parse,
+    seal,
+)
 
 _CHUNK_BYTES = 1 << 20
 _Message = tuple[int, int, str, bytes, int]
@@ -77,18 +90,21 @@ def write_amended(
     """
     if target.exists() and target.samefile(source):
         raise LogError(f"{target}: is the log itself; give another name with -o")
-    with LogFile(source) as log, written_whole(target) as out:
-        return _AmendedCopy(log, out, anew or {}, {entry.topic for entry in added}).run(
-            added, more, metadata or {}, salvage
-        )
+    with ExitStack() as opened:
+        logs = [opened.enter_context(LogFile(part)) for part in log_parts(source)]
+        out = opened.enter_context(written_whole(target))
+        copy = _AmendedCopy(source, logs, out, anew or {}, {entry.topic for entry in added})
+        return copy.run(added, more, metadata or {}, salvage)
 
 
 class _AmendedCopy:
     """A log on its way into another file."""
 
-    def __init__(self, log: LogFile, out: BinaryIO, anew: Mapping[str, str], added: Set[str]) -> None:
-        self._log, self._anew, self._taken = log, anew, set(added - anew.keys())
-        self._passage = Passage(log, lambda _: Keep.ALL, may_skip=False)
+    def __init__(
+        self, source: Path, logs: list[LogFile], out: BinaryIO, anew: Mapping[str, str], added: Set[str]
+    ) -> None:
+        self._source, self._anew, self._taken = source, anew, set(added - anew.keys())
+        self._passages = [(log, Passage(log, lambda _: Keep.ALL, may_skip=False)) for log in logs]
         self._writer = Writer(out, chunk_size=_CHUNK_BYTES, enable_data_crcs=True)
         self._schemas: dict[tuple[str, str, bytes], int] = {("", "", b""): 0}
         self._channels: dict[str, int] = {}
@@ -102,8 +118,8 @@ class _AmendedCopy:
         metadata: Mapping[str, Mapping[str, str]],
         salvage: bool,
     ) -> Amended:
-        writer, passage, amended = self._writer, self._passage, self._amended
-        with self._log.path.open("rb") as stream:
+        writer, amended, damage = self._writer, self._amended, Damage()
+        with self._passages[0][0].path.open("rb") as stream:
             try:
                 head = next(iter(StreamReader(stream).records), None)
             except McapError:
@@ -113,11 +129,13 @@ class _AmendedCopy:
         merged = heapq.merge(self._streamed(more), self._recorded(), self._added(added), key=lambda message: message[0])
         for log_time, publish_time, topic, payload, number in merged:
             writer.add_message(self._channels[topic], log_time, payload, publish_time, number)
-        recording = Recording(self._log.path, damage=passage.damage, beginning_ns=self._beginning_ns)
+        for log, passage in self._passages:
+            damage.extend(passage.damage, log.path.name if len(self._passages) > 1 else "")
+        recording = Recording(self._source, damage=damage, beginning_ns=self._beginning_ns)
         if not salvage:
             recording.require_sound()
-        for record in passage.others:
-            content = self._log.content(record)
+        for log, record in ((log, record) for log, passage in self._passages for record in passage.others):
+            content = log.content(record)
             if record.opcode == Opcode.METADATA:
                 found = parse(Metadata.read, content)
                 writer.add_metadata(found.name, found.metadata)
@@ -135,8 +153,12 @@ class _AmendedCopy:
 
     def _recorded(self) -> Iterator[_Message]:
         """Messages of the log that are copied; those of one chunk in the order of their times."""
-        for _, chunk in groupby(self._passage, key=lambda piece: id(piece.data)):
-            pieces = [piece for piece in chunk if self._is_copied(piece)]
+        for _, passage in self._passages:
+            yield from self._recorded_in(passage)
+
+    def _recorded_in(self, passage: Passage) -> Iterator[_Message]:
+        for _, chunk in groupby(passage, key=lambda piece: id(piece.data)):
+            pieces = [piece for piece in chunk if self._is_copied(piece, passage)]
             if not pieces:
                 continue
             data = pieces[0].data
@@ -152,7 +174,7 @@ class _AmendedCopy:
                 )
                 yield int(time_ns[row]), published_ns, topic, payload, number
 
-    def _is_copied(self, piece: ChunkPart) -> bool:
+    def _is_copied(self, piece: ChunkPart, passage: Passage) -> bool:
         """Tell whether messages of a topic are copied; if so, the topic is made known to the writer."""
         first_ns = int(piece.found.log_times_ns.min())
         self._beginning_ns = first_ns if self._beginning_ns is None else min(first_ns, self._beginning_ns)
@@ -160,13 +182,13 @@ class _AmendedCopy:
         wanted = self._anew.get(topic.name)
         if topic.name in self._taken or (wanted is not None and short_name(topic.type_name) != short_name(wanted)):
             raise LogError(
-                f"{self._log.path}: {topic.name} ({topic.type_name}) is in the log already; "
+                f"{self._source}: {topic.name} ({topic.type_name}) is in the log already; "
                 "leave it out where the log is made"
             )
         if wanted is not None:
             self._amended.replaced[topic.name] += len(piece.found.sizes)
             return False
-        channel, schema = self._passage.as_written[topic.name]
+        channel, schema = passage.as_written[topic.name]
         self._offer(topic.name, (schema.name, schema.encoding, schema.data), topic.encoding, channel.metadata)
         return True
 

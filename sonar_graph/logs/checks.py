@@ -46,6 +46,9 @@ _ROTATIONS = {(0, False): "[0, -90, 0]", (0, True): "[0, 90, 0]", (1, False): "[
 """Rotation to give, by the axis along which gravity is felt, and whether against it."""
 
 
+DAY_S = 86_400.0
+
+
 def stamp_faults(stamps_ns: Ints, log_times_ns: Ints) -> Iterator[str]:
     """Faults of header stamps, shape (n,): missing, backwards, repeated, far from times of recording, or drifting."""
     unset = (stamps_ns == 0) & (log_times_ns != 0)  # data sets begin at 0: recorded at 0, a stamp of 0 is right
@@ -64,7 +67,10 @@ def stamp_faults(stamps_ns: Ints, log_times_ns: Ints) -> Iterator[str]:
         yield f"{_count(repeated, 'message')} with the stamp of another"
     lag_ns = log_times_ns - stamps_ns
     typical_s = float(np.median(lag_ns)) / 1e9
-    if abs(typical_s) > LARGEST_LAG_S:
+    if abs(typical_s) > DAY_S:
+        side = "before" if typical_s > 0 else "after"
+        yield f"stamped {abs(typical_s) / DAY_S:.0f} days {side} recording: a log was played, or a clock was not set"
+    elif abs(typical_s) > LARGEST_LAG_S:
         side = "before" if typical_s > 0 else "after"
         yield f"stamped {abs(typical_s):.4g} s {side} recording: another clock, or a delay"
     first_s, last_s = (float(np.median(part)) / 1e9 for part in (lag_ns[:20], lag_ns[-20:]))

@@ -71,7 +71,17 @@ class RoleSummary:
 
 @dataclass(frozen=True)
 class LogSummary:
-    """Content of a log, and its faults."""
+    """Content of a log, and its faults.
+
+    Examples
+    --------
+    >>> from sonar_graph import inspect_log, write_log
+    >>> from sonar_graph.testing import small_world
+    >>> write_log("dive.mcap", small_world())
+    >>> summary = inspect_log("dive.mcap")
+    >>> summary.damage, summary.warnings
+    ((), ())
+    """
 
     path: Path
     name: str | None
@@ -83,6 +93,8 @@ class LogSummary:
     notes: dict[str, str]
     damage: tuple[str, ...]
     """Lost or unreadable parts; empty for a sound file."""
+    unusable: tuple[str, ...] = ()
+    """Reasons why sound messages cannot be used as they are, such as a class without an identity, and what to do."""
     left_out: tuple[str, ...] = ()
     """Rows that are not fit for use, by role and reason."""
     warnings: tuple[str, ...] = ()
@@ -176,13 +188,13 @@ def inspect_log(
         notes = {}
         damage.append(str(error))
     summaries = tuple(_summarise(topic) for topic in recording.topics.values())
-    left_out, warnings = list[str](), list[str]()
+    left_out, warnings, unusable = list[str](), list[str](), list[str]()
     try:
         left_out, warnings = Assembly(recording, {name: choices[name] for name in SEQUENCE_ROLES}).survey()
     except CalibrationError:
         pass  # `calibration` says so
     except SonarGraphError as error:
-        damage.append(str(error))
+        unusable.append(str(error))
     sonar = None
     if (sonar_topic := choices[SONAR].topic) is not None:
         try:
@@ -198,6 +210,7 @@ def inspect_log(
         calibration=calibration,
         notes=notes,
         damage=tuple(damage),
+        unusable=tuple(unusable),
         left_out=tuple(left_out),
         warnings=tuple(warnings),
         sonar=sonar,

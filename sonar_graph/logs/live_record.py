@@ -112,7 +112,12 @@ class LiveRecord:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._stream = path.open("xb")
+        try:
+            self._stream = path.open("xb")
+        except FileExistsError as error:
+            raise LogError(f"{path}: a record is there already; name another folder") from error
+        except OSError as error:
+            raise LogError(f"{path}: cannot be written: {error.strerror}") from error
         self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, enable_data_crcs=True)
         self._writer.start(profile="ros2", library=LIBRARY)
         self._schemas: dict[str, int] = {}

@@ -16,8 +16,11 @@ from sonar_graph.errors import LogError
 from sonar_graph.files import as_path, spelt
 from sonar_graph.images import SonarFrames
 from sonar_graph.logs.adapters import (
+    Adapter,
     DepthAdapter,
     Dropped,
+    FieldTable,
+    GeodeticFields,
     HeadingAdapter,
     LogConfig,
     MessageTable,
@@ -27,7 +30,6 @@ from sonar_graph.logs.adapters import (
     TruthAdapter,
     changes_text,
     detection_warnings,
-    plain_lines,
     shipped_like,
 )
 from sonar_graph.logs.cdr import short_name
@@ -49,13 +51,13 @@ from sonar_graph.logs.roles import ROLES, SEQUENCE_ROLES, SONAR, Choice, choose_
 from sonar_graph.logs.vehicle_setup import (
     PartialCalibration,
     gathered,
-    measured_start,
     mounted_by,
     mounting_of,
     read_calibration,
     read_notes,
     recorded_name,
     static_frames,
+    with_measured_start,
 )
 from sonar_graph.measurements import Block, Dvl, Floats, Imu
 from sonar_graph.sequence import Sequence
@@ -228,7 +230,7 @@ class Assembly:
         """The calibration of user, record, ``/tf_static`` and defaults, with its sources in the notes."""
         recorded = read_calibration(self._recording)
         is_recorded = recorded is not None and bool(recorded.model_fields_set - {"sonar"})  # images bring their own
-        self._is_start_stated = is_recorded or bool(given and "start" in given.values)
+        self._is_start_stated = is_recorded or bool(given and given.values.get("start"))
         stated = mounted_by(recorded.model_dump(exclude_unset=True)) if recorded else set()
         stated |= mounted_by(given.values) if given else set()
         frames = {
@@ -299,20 +301,9 @@ class Assembly:
 
         The note ``log.origin`` has it.
         """
-        of_earth = {
-            role: adapter.geodetic
-            for role in ("positions", "truth")
-            if role in self._tables and (adapter := self.adapters[role]).geodetic is not None
-        }
-        said = [fields.origin_deg_m for fields in of_earth.values() if fields.origin_deg_m is not None]
-        found = [fix for role, fields in of_earth.items() if (fix := fields.first_fix(self._tables[role])) is not None]
-        if not said and not found:
-            return None
-        latitude_deg, longitude_deg, height_m = origin = (said or found)[0]
-        self._notes["log.origin"] = (
-            f"of the world, x east, y north: latitude {latitude_deg:.8f}°, longitude {longitude_deg:.8f}°, height "
-            f"{height_m:.3f} m, {'as configured' if said else 'the first fix'}"
-        )
+        origin, said = common_origin(self.adapters, self._tables)
+        if said:
+            self._notes["log.origin"] = said
         return origin
 
     def sequence(self, name: str | None = None) -> Sequence:
@@ -332,11 +323,7 @@ class Assembly:
             for text in stamp_faults(table.stamps_ns, table.topic.log_times_ns)
         ]
         if not self._is_start_stated:
-            start_ns = int(max(blocks["imu"].stamps_ns[0], blocks["dvl"].stamps_ns[0]))
-            if (start := measured_start(self.calibration, start_ns, blocks["dvl"], blocks)) is not None:
-                self.calibration = self.calibration.model_copy(update={"start": start})
-                said = ", ".join(plain_lines(start.model_dump()))
-                self._notes["log.start"] = f"not stated, so by the first headings and fixes: {said}"
+            self.calibration, self._notes["log.start"] = with_measured_start(self.calibration, blocks)
         findings = {
             "log.dropped": self.left_out(),
             "log.stamps": stamps,
@@ -390,6 +377,29 @@ class Assembly:
             first_ns, last_ns = max(ns.min() for ns in stamps), min(ns.max() for ns in stamps)
             texts = detection_warnings(detections, int(first_ns), int(last_ns))
             yield from (f"detections: {text}" for text in texts)
+
+
+def common_origin(
+    adapters: Mapping[str, Adapter], tables: Mapping[str, FieldTable]
+) -> tuple[Origin | None, str | None]:
+    """Origin that fixes and true positions on the Earth share, in degrees and metres, and a note about it.
+
+    The configured one, or the first fix; None without any. Adapters and tables are by role.
+    """
+    of_earth: dict[str, GeodeticFields] = {}
+    for role in ("positions", "truth"):
+        adapter = adapters.get(role)
+        if role in tables and isinstance(adapter, PositionAdapter | TruthAdapter) and adapter.geodetic is not None:
+            of_earth[role] = adapter.geodetic
+    said = [fields.origin_deg_m for fields in of_earth.values() if fields.origin_deg_m is not None]
+    found = [fix for role, fields in of_earth.items() if (fix := fields.first_fix(tables[role])) is not None]
+    if not said and not found:
+        return None, None
+    latitude_deg, longitude_deg, height_m = origin = (said or found)[0]
+    return origin, (
+        f"of the world, x east, y north: latitude {latitude_deg:.8f}°, longitude {longitude_deg:.8f}°, height "
+        f"{height_m:.3f} m, {'as configured' if said else 'the first fix'}"
+    )
 
 
 def rows_of(

@@ -42,6 +42,15 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
     ------
     LogError
         When the file cannot be written.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from sonar_graph.logs import write_tum
+    >>> from sonar_graph.testing import small_world
+    >>> write_tum(Path("truth.tum"), small_world().true_poses)
+    >>> len(Path("truth.tum").read_text().splitlines()[-1].split())
+    8
     """
     poses = np.hstack([trajectory.positions, trajectory.quaternions_xyzw]).tolist()
     lines = []
@@ -88,6 +97,15 @@ def write_landmarks_csv(path: Path, landmarks: LandmarkMap) -> None:
     ------
     LogError
         When the file cannot be written.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from sonar_graph.logs import write_landmarks_csv
+    >>> from sonar_graph.testing import small_world
+    >>> write_landmarks_csv(Path("map.csv"), small_world().true_landmarks)
+    >>> print(Path("map.csv").read_text().splitlines()[0])
+    id,x_m,y_m,z_m,cov_xx,cov_xy,cov_xz,cov_yy,cov_yz,cov_zz
     """
     lines = [",".join(LANDMARK_COLUMNS)]
     triangles = landmarks.covariances[:, _UPPER[0], _UPPER[1]]

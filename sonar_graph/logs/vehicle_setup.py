@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 from sonar_graph.calibration import Calibration, Mounting, Start
 from sonar_graph.errors import CalibrationError, LogError
 from sonar_graph.files import text_of
+from sonar_graph.logs.adapters import plain_lines
 from sonar_graph.logs.cdr import Bytes, Value, definition, encode, parse_definition, short_name
 from sonar_graph.logs.mcap import Keep, Recording, scan
 from sonar_graph.logs.roles import TF
@@ -200,14 +201,39 @@ def gathered(
 
 
 def recorded_calibration(calibration: Calibration) -> str:
-    """JSON of a calibration for a log's record, without a start that nobody stated."""
-    return calibration.model_dump_json(exclude=None if "start" in calibration.model_fields_set else {"start"})
+    """JSON of a calibration for a log's record, without what nobody stated of the start."""
+    said = calibration.start.model_fields_set
+    exclude: dict[str, bool | set[str]] = {}
+    if "start" not in calibration.model_fields_set:
+        exclude["start"] = True
+    elif said and "position_m" not in said:  # measured by a heading
+        exclude["start"] = {"position_m"}
+    return calibration.model_dump_json(exclude=exclude)
 
 
 NEAREST_ROWS = 5
 """Rows about the start of which the median counts, so that one wrong row does not."""
 WIDER = 3.0
 """Factor from a row's sigma to the start's: the rows are measurements too, and so count twice by a ninth only."""
+
+
+NO_START = (
+    "not stated, and neither heading nor fixes say it: the world begins at the vehicle with x forward; state it as "
+    "[start] position_m and rpy_rad in a file for --calibration where it matters"
+)
+
+
+def with_measured_start(calibration: Calibration, blocks: Mapping[str, Any]) -> tuple[Calibration, str]:
+    """Calibration with the start by the first headings and fixes, where there are any, and a note about it."""
+    start_ns = int(max(blocks["imu"].stamps_ns[0], blocks["dvl"].stamps_ns[0]))
+    start = measured_start(calibration, start_ns, blocks["dvl"], blocks)
+    if start is None:
+        return calibration, NO_START
+    said = ", ".join(plain_lines(start.model_dump()))
+    return (
+        calibration.model_copy(update={"start": start}),
+        f"not stated, so by the first headings and fixes: {said}",
+    )
 
 
 def measured_start(calibration: Calibration, start_ns: int, dvl: Dvl, blocks: Mapping[str, Any]) -> Start | None:

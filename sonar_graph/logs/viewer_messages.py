@@ -12,6 +12,7 @@ and one for RViz 2, with a camera, a grid and lines that fit the result. A new k
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
@@ -22,7 +23,6 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from sonar_graph.errors import LogError
 from sonar_graph.files import replacing
@@ -33,6 +33,7 @@ from sonar_graph.logs.roles import ODOMETRY, POSE_WITH_COVARIANCE
 from sonar_graph.logs.trajectory_files import LANDMARK_COLUMNS
 from sonar_graph.logs.writing import WORLD_FRAME, fields, header, outgoing
 from sonar_graph.measurements import Floats
+from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.states import LandmarkMap, Trajectory
 
 MARKER_ARRAY = "visualization_msgs/msg/MarkerArray"
@@ -42,7 +43,7 @@ UNKNOWN_DIAMETER_M = 0.2
 _SMALLEST_DIAMETER_M = 1e-3
 ELLIPSOID, UNKNOWN, IDENTITY = "ellipsoid_95_percent", "covariance_unknown", "identity"
 _FAINT = 0.35
-_SIGMAS = float(np.sqrt(chi2.ppf(0.95, df=3)))
+_SIGMAS = math.sqrt(chi_square_quantile(0.95, 3))
 Colour = tuple[float, float, float, float]
 BLUE: Colour = (0.12, 0.47, 0.71, 0.8)
 ORANGE: Colour = (1.0, 0.5, 0.05, 0.8)

@@ -9,10 +9,12 @@ from sonar_graph.navigation.alignment import InitialTilt, align_at_rest, align_i
 from sonar_graph.navigation.joint_preintegration import (
     DISPLACEMENT, ROTATION, DopplerRule, JointMotion, JointPreintegrator,
 )
+from sonar_graph.navigation.moved_poses import MovedPoses
 from sonar_graph.navigation.odometry import Odometry
 from sonar_graph.navigation.samples import finite_vector, in_numbers
 
 __all__ = [
     "DISPLACEMENT", "DopplerRule", "InitialTilt", "JointMotion", "JointPreintegrator", "MotionSource", "Motions",
-    "Odometry", "PreintegratedMotion", "ROTATION", "align_at_rest", "align_in_motion", "finite_vector", "in_numbers",
+    "MovedPoses", "Odometry", "PreintegratedMotion", "ROTATION", "align_at_rest", "align_in_motion", "finite_vector",
+    "in_numbers",
 ]

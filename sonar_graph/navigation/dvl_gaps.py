@@ -39,6 +39,7 @@ from sonar_graph.navigation.sums import START, motions_over
 FEWEST, SHORTEST_S = 4, 1.0
 """Fewest samples of a line, and the shortest time that they span."""
 ZERO = np.zeros(3)
+LATEST = np.array([LATEST_NS])
 
 
 class Sensors(NamedTuple):
@@ -96,12 +97,12 @@ def continued(
     so_far: Stretch, rows: Rows, sensors: Sensors, end_ns: int, bias: Floats, earth: Floats
 ) -> tuple[Stretch, PreintegratedMotion]:
     """Sums continued to an instant, and the motion from their start; the Earth's rotation in the frame there."""
-    from_, until, known, sums = *np.array([[so_far.until_ns], [end_ns], [LATEST_NS]]), so_far.sums.copy()
+    from_, until, sums = np.array([so_far.until_ns]), np.array([end_ns]), so_far.sums.copy()
     noise = bias, earth, sensors.body_p_dvl, sensors.gyro_density
-    dR, dp, C, D, impulse = (c[0] for c in motions_over(rows, from_, until, known, LATEST_NS, *noise, sums))
+    dR, dp, C, D, impulse = motions_over(rows, from_, until, LATEST, LATEST_NS, *noise, sums)
     duration_s = (end_ns - so_far.start_ns) * 1e-9
-    mean_force = impulse / duration_s if duration_s > 0 else np.full(3, np.nan)
-    motion = PreintegratedMotion(gtsam.Pose3(gtsam.Rot3(dR), dp), C, D, bias, duration_s, mean_force)
+    mean_force = impulse[0] / duration_s if duration_s > 0 else np.full(3, np.nan)
+    motion = PreintegratedMotion(gtsam.Pose3(gtsam.Rot3(dR[0]), dp[0]), C[0], D[0], bias, duration_s, mean_force)
     return Stretch(so_far.start_ns, end_ns, sums), motion
 
 
@@ -192,7 +193,7 @@ def _inertial(
         line = Line(cuts_ns, True, weights_s[:1], jumps[:2], still[:1], still[:1], start_ns)
     else:
         line = Line(np.append(cuts_ns, end_ns), True, np.cumsum(weights_s), jumps, still, still, start_ns)
-    sums = sums_along(rows, imu_rows, line, turn.T, bias, earth)
+    sums = sums_along(rows, imu_rows, line, np.ascontiguousarray(turn.T), bias, earth)
     R, T = sums.R[-1], (end_ns - start_ns) * 1e-9
     v, _, s = sums.whole.reshape(3, 3)
     at_samples = sums.R[: len(samples)]

@@ -77,6 +77,23 @@ class JointMotion:
 
     Errors are ``[theta, dv, dp, ds]``: theta in frame j (``R Exp(theta)``), the others added in frame i. Where the
     specific force was not measured, velocity, position, and their covariances and derivatives are NaN.
+
+    Examples
+    --------
+    A gyro bias that is known later, to first order:
+
+    >>> import numpy as np
+    >>> from sonar_graph.measurements import Dvl, Imu
+    >>> from sonar_graph.navigation import JointPreintegrator
+    >>> imu_ns, dvl_ns = np.arange(201) * 5_000_000, np.arange(6) * 200_000_000
+    >>> imu = Imu(imu_ns, np.zeros((201, 3)), np.tile([0.0, 0.0, 9.81], (201, 1)))
+    >>> dvl = Dvl(dvl_ns, np.tile([0.5, 0.0, 0.0], (6, 1)), np.full((6, 3, 3), np.nan))
+    >>> sensors = JointPreintegrator(gyro_noise_density=1e-4, accel_noise_density=1e-3)
+    >>> motion = sensors.integrate(imu, dvl, 0, 1_000_000_000)
+    >>> change = np.zeros(10)
+    >>> change[2] = 0.01
+    >>> round(motion.corrected(change).i_R_j.yaw(), 4)
+    -0.01
     """
 
     i_R_j: gtsam.Rot3

@@ -139,7 +139,7 @@ class Odometry:
     def epochs(self, after_ns: int, until_ns: int) -> Ints:
         """Epochs after one instant that are reached at another, in order, shape (n,)."""
         dvl_ns = self._dvl.stamps_ns
-        first, last = _epochs_between(after_ns, until_ns, self._imu.stamps_ns, dvl_ns, self._dvl.values[2])
+        first, last = epochs_between(after_ns, until_ns, self._imu.stamps_ns, dvl_ns, self._dvl.values[2])
         return dvl_ns[first:last]
 
     def epochs_reached(self, after_ns: int, until_ns: int) -> tuple[Ints, Ints]:
@@ -196,7 +196,7 @@ class Odometry:
         """Motions over intervals, each from rows known at its ``known_ns``."""
         sensors = self._sensors
         noise = bias, ZERO, sensors.body_p_dvl, sensors.gyro_density
-        return motions_over(self._rows(), start_ns, end_ns, known_ns, sensors.longest_ns, *noise)
+        return motions_over(self.rows(), start_ns, end_ns, known_ns, sensors.longest_ns, *noise)
 
     def velocity_at_imu(self, epoch_ns: int) -> tuple[Floats, float]:
         """Velocity of the IMU's point at an epoch, body axes, shape (3,), m/s, and the variance of one component."""
@@ -214,7 +214,8 @@ class Odometry:
         swing = y * c - z * b, z * a - x * c, x * b - y * a
         return velocity[k] + swing, float(cov[k, 0, 0] + cov[k, 1, 1] + cov[k, 2, 2]) / 3.0
 
-    def _rows(self) -> Rows:
+    def rows(self) -> Rows:
+        """Rows of both sensors that are still needed."""
         (rate, force), (velocity, cov, known_ns) = self._imu.values, self._dvl.values
         imu_ns, dvl_ns = self._imu.stamps_ns, self._dvl.stamps_ns
         return Rows(imu_ns, rate, force, dvl_ns, velocity, cov, known_ns, self._hold_past, self._turns)
@@ -226,7 +227,7 @@ class Odometry:
 
         Over gaps between epochs it goes by bridges; between gaps it is one sum of steps.
         """
-        rows, sensors = self._rows().known(known_ns), self._sensors
+        rows, sensors = self.rows().known(known_ns), self._sensors
         epochs_ns = self.epochs(start_ns - 1, known_ns)
         epochs_ns = epochs_ns[: epochs_ns.searchsorted(end_ns, side="right")]
         newest_ns = int(epochs_ns[-1]) if len(epochs_ns) else start_ns
@@ -235,16 +236,18 @@ class Odometry:
             kept = of, None, Stretch(start_ns, start_ns)
         _, before, stretch = kept
         new_ns = epochs_ns[epochs_ns.searchsorted(stretch.until_ns) :]
-        for k in np.flatnonzero(np.diff(new_ns) > sensors.longest_ns).tolist():
+        for k in np.flatnonzero(np.diff(new_ns) > sensors.longest_ns).tolist() if len(new_ns) > 1 else ():
             lost_ns, found_ns = int(new_ns[k]), int(new_ns[k + 1])
             _, before = self._followed(before, stretch, rows, lost_ns, bias, earth)
             over = bridge(rows, sensors, lost_ns, found_ns, True, bias, _in_frame(before, earth))
             before, stretch = _joined(before, over), Stretch(found_ns, found_ns)
+        motion, is_lost = None, len(epochs_ns) > 0 and self.is_gap(newest_ns, end_ns)
+        last_ns = newest_ns if is_lost else end_ns
         if stretch.until_ns < newest_ns:
-            stretch, _ = self._followed(before, stretch, rows, newest_ns, bias, earth)
+            stretch, motion = self._followed(before, stretch, rows, newest_ns, bias, earth)
         self._kept = of, before, stretch
-        is_lost = len(epochs_ns) > 0 and self.is_gap(newest_ns, end_ns)
-        _, motion = self._followed(before, stretch, rows, newest_ns if is_lost else end_ns, bias, earth)
+        if motion is None or last_ns > newest_ns:
+            _, motion = self._followed(before, stretch, rows, last_ns, bias, earth)
         if is_lost:
             earth = _in_frame(motion, earth)
             return _joined(motion, bridge(rows, sensors, newest_ns, end_ns, False, bias, earth, asked_ns))
@@ -266,7 +269,7 @@ def _joined(before: PreintegratedMotion | None, motion: PreintegratedMotion) -> 
 
 
 @compiled
-def _epochs_between(after_ns: int, until_ns: int, imu_ns: Ints, dvl_ns: Ints, known_ns: Ints) -> tuple[int, int]:
+def epochs_between(after_ns: int, until_ns: int, imu_ns: Ints, dvl_ns: Ints, known_ns: Ints) -> tuple[int, int]:
     """First and last row (exclusive) of `Odometry.epochs`."""
     seen, first, last = rows_until(imu_ns, until_ns), rows_until(dvl_ns, after_ns), 0
     if seen > 0:
@@ -277,7 +280,7 @@ def _epochs_between(after_ns: int, until_ns: int, imu_ns: Ints, dvl_ns: Ints, kn
 @compiled
 def _epochs_reached(after_ns: int, until_ns: int, imu_ns: Ints, dvl_ns: Ints, known_ns: Ints) -> tuple[int, int, Ints]:
     """First and last row (exclusive) of `Odometry.epochs`, and when these are reached."""
-    first, last = _epochs_between(after_ns, until_ns, imu_ns, dvl_ns, known_ns)
+    first, last = epochs_between(after_ns, until_ns, imu_ns, dvl_ns, known_ns)
     reached_ns = np.empty(last - first, np.int64)
     for k in range(len(reached_ns)):
         reached_ns[k] = max(imu_ns[rows_until(imu_ns, dvl_ns[first + k] - 1)], known_ns[first + k])

@@ -67,7 +67,7 @@ def motions_over(
     n, is_new = len(start_ns), sums is None
     sums = np.zeros((20 * n, 3)) if sums is None else sums
     C, D = np.empty((n, 6, 6)), np.empty((n, 6, 3))
-    _write_motions(
+    write_motions(
         rows, start_ns, end_ns, known_ns, longest_ns, bias, earth, body_p_dvl, gyro_density, is_new, sums, C, D
     )
     dR, dp, impulse = sums[: 3 * n].reshape(n, 3, 3), sums[3 * n : 4 * n], sums[4 * n : 5 * n]
@@ -75,7 +75,7 @@ def motions_over(
 
 
 @compiled
-def _write_motions(
+def write_motions(
     rows: Rows,
     start_ns: Ints,
     end_ns: Ints,

@@ -217,8 +217,8 @@ def rodrigues(phi: Vec3, x: float, a: float, b: float) -> Mat3:
 
 
 @inlined
-def rotation_log(R: Mat3) -> Vec3:
-    """Rotation vector, at any angle, by the largest part of the quaternion (Shepperd, JGC 1(3), 1978)."""
+def quaternion(R: Mat3) -> tuple[Vec3, float]:
+    """Quaternion of any length, scalar last and not negative, by its largest part (Shepperd, JGC 1(3), 1978)."""
     xx, yy, zz = R.x.x, R.y.y, R.z.z
     across = Vec3(R.z.y - R.y.z, R.x.z - R.z.x, R.y.x - R.x.y)
     w2 = xx + yy + zz
@@ -232,6 +232,13 @@ def rotation_log(R: Mat3) -> Vec3:
         w, v = across.z, Vec3(R.x.z + R.z.x, R.y.z + R.z.y, 1.0 + zz - xx - yy)
     if w < 0.0:
         w, v = -w, -1.0 * v
+    return v, w
+
+
+@inlined
+def rotation_log(R: Mat3) -> Vec3:
+    """Rotation vector, at any angle."""
+    v, w = quaternion(R)
     n = math.sqrt(v @ v)
     return (2.0 * math.atan2(n, w) / n if n > 0.0 else 0.0) * v
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import minimize, minimize_scalar
 from scipy.special import log_softmax
 
 from sonar_graph.devices import DEFAULT_DESIGNS, LandmarkDesign
@@ -43,10 +43,8 @@ NO_LABEL = -2
 NONE = -1
 LEAST_FRAMES = 3
 """Labelled frames that every class needs."""
-MOST_CORRELATED = 0.99
-"""Upper limit of the correlation: some 200 frames for each detection."""
 PRIOR_SHARE = 0.25
-"""Standard deviation of a weight about that of the shipped model, as a share of it; and of the logarithm of looks."""
+"""Standard deviation of what is fitted about the shipped model, as a share of it; of looks, of their logarithm."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,20 +53,20 @@ class LabelledFits:
 
     evidence: Floats
     """For each design, in the columns of `EVIDENCE`, shape (n, ids, 9)."""
-    visible: Floats
-    """Share of the template in view, shape (n,)."""
+    bound_m: Floats
+    """`ObjectSighting.bound_m`, shape (n, 2)."""
     label: Ints
     """Index of the true class; the number of ids for "none of them", shape (n,)."""
     track: Ints
     """Track of each patch, shape (n,); frames of one track are not independent."""
     news: Floats
     """Independent share of each frame of a track, shape (n,)."""
-    range_azimuth_error: Floats
-    """Measured minus true (m, rad), shape (n, 2); NaN where there is no landmark."""
+    error_m: Floats
+    """Measured minus true along the ray and across it, shape (n, 2); NaN where there is no landmark."""
     range_per_height: Floats
     """`ObjectSighting.range_per_height`, shape (n,)."""
-    bin_m: Floats
-    """`ObjectSighting.bin_m`, shape (n,)."""
+    stamp_ns: Ints
+    """Stamp of each frame, shape (n,)."""
 
 
 class LabelledSightings:
@@ -76,11 +74,12 @@ class LabelledSightings:
 
     def __init__(self, ids: tuple[int, ...]) -> None:
         self.ids = ids
-        self._rows: list[tuple[Floats, float, int, tuple[int, int], float, tuple[float, float], float, float]] = []
+        self._rows: list[tuple[Floats, Floats, int, tuple[int, int], float, tuple[float, float], float, int]] = []
 
     def add(
         self,
         sighting: ObjectSighting,
+        stamp_ns: int,
         track: tuple[int, int],
         news: float,
         ids: Ints,
@@ -90,14 +89,14 @@ class LabelledSightings:
         """Add a sighting of a track (log, number), given the true range and azimuth of every landmark, shapes (m,)."""
         label, at = label_of(sighting, ids, range_m, azimuth_rad)
         known, fit = label != NONE, sighting.fit
-        if fit is None or label == NO_LABEL or (known and label not in self.ids):
+        if fit is None or sighting.bound_m is None or label == NO_LABEL or (known and label not in self.ids):
             return
         error = np.nan, np.nan
         if known:
-            error = sighting.range_m - range_m[at], sighting.azimuth_rad - azimuth_rad[at]
+            error = sighting.range_m - range_m[at], range_m[at] * (sighting.azimuth_rad - azimuth_rad[at])
         row = self.ids.index(label) if known else len(self.ids)
         self._rows.append(
-            (fit.evidence, fit.visible, row, track, news, error, sighting.range_per_height, sighting.bin_m)
+            (fit.evidence, sighting.bound_m, row, track, news, error, sighting.range_per_height, stamp_ns)
         )
 
     def add_frame(self, recogniser: Recogniser, run: Run, log: int) -> None:
@@ -111,7 +110,7 @@ class LabelledSightings:
         tracks = zip(recogniser.track_ids.tolist(), recogniser.news.tolist(), recogniser.sightings, strict=True)
         for track, news, sighting in tracks:
             if sighting is not None:
-                self.add(sighting, (log, track), news, run.true_landmarks.ids, range_m, azimuth_rad)
+                self.add(sighting, stamp_ns, (log, track), news, run.true_landmarks.ids, range_m, azimuth_rad)
 
     def extend(self, other: LabelledSightings) -> None:
         """Add all sightings of other logs, with the same designs."""
@@ -120,16 +119,16 @@ class LabelledSightings:
     def fits(self) -> LabelledFits:
         """All of them as columns."""
         columns = zip(*self._rows, strict=True) if self._rows else [()] * 8
-        evidence, visible, label, track, news, error, rise, bin_m = columns
+        evidence, bound, label, track, news, error, rise, stamp_ns = columns
         return LabelledFits(
             np.array(evidence, float).reshape(-1, len(self.ids), len(EVIDENCE)),
-            np.array(visible, float),
+            np.array(bound, float).reshape(-1, 2),
             np.array(label, np.int64),
             np.unique(np.reshape(track, (-1, 2)), axis=0, return_inverse=True)[1].ravel(),
             np.array(news, float),
             np.array(error, float).reshape(-1, 2),
             np.array(rise, float),
-            np.array(bin_m, float),
+            np.array(stamp_ns, np.int64),
         )
 
 
@@ -233,11 +232,8 @@ def estimate_confusion(
     odds = np.pad(fits.evidence @ weights, ((0, 0), (0, 1)))
     matrix = confusion_rows(soft_scores(odds, looks), fits.label, trials)
     height_bias_m, error = without_height(fits)
-    seen = max(int(tracks[:-1].sum()), 2)
-    bin_m = float(np.median(fits.bin_m))
-    looks_lost = np.maximum(fits.bin_m / bin_m, 1.0)[:, None]  # as `Confusion.range_azimuth_cov`
-    mean_squares = np.nanmean((error * fits.visible[:, None] ** 2) ** 2 / looks_lost, axis=0)
-    sigmas = np.sqrt(mean_squares * seen / (seen - 1))  # errors of a track repeat, and the bias is that of these tracks
+    usual, sigmas, power = accuracy(error, fits.bound_m, fits.track, shipped.bound_power)
+    spread = sigmas * (fits.bound_m / usual) ** power
     return Confusion(
         ids=ids,
         designs=tuple(map(mark_of, designs)),
@@ -246,11 +242,13 @@ def estimate_confusion(
         looks=looks,
         doubt=shipped.doubt,
         range_sigma_m=float(sigmas[0]),
-        azimuth_sigma_rad=float(sigmas[1]),
-        bin_m=bin_m,
+        across_sigma_m=float(sigmas[1]),
+        range_bound_m=float(usual[0]),
+        across_bound_m=float(usual[1]),
+        bound_power=power,
         height_bias_m=height_bias_m,
         roughness=roughness_of_tracks(fits),
-        error_correlation=error_correlation(error, fits.track),
+        report_interval_s=report_interval_s(error / spread, fits.track, fits.stamp_ns, shipped.report_interval_s),
         provenance=provenance
         | {f"frames of {n}": str(c) for n, c in zip(names, counts.tolist(), strict=True)}
         | {f"tracks of {n}": str(c) for n, c in zip(names, tracks.tolist(), strict=True)},
@@ -271,7 +269,7 @@ def without_height(fits: LabelledFits) -> tuple[float, Floats]:
     A face that is higher by b seems nearer by ``b h / r``, with h the height of the sonar: where sound arrives first.
     Each track counts once.
     """
-    error, rise = fits.range_azimuth_error.copy(), fits.range_per_height
+    error, rise = fits.error_m.copy(), fits.range_per_height
     known = np.isfinite(error[:, 0]) & (rise > 0)
     if not known.any():
         return 0.0, error
@@ -281,18 +279,48 @@ def without_height(fits: LabelledFits) -> tuple[float, Floats]:
     return bias_m, error
 
 
-def error_correlation(error: Floats, track_of: Ints) -> float:
-    """Correlation of the errors of a track's successive frames, at least 0: the mean of range's and azimuth's.
+def accuracy(
+    error: Floats, bound: Floats, track_of: Ints, prior_power: float, powers: tuple[float, float] = (0.0, 4.0)
+) -> tuple[Floats, Floats, float]:
+    """Usual bounds along the ray and across, their sigmas there, and the power of the bound, as `Confusion` has them.
 
-    No mean is taken from the errors: one that all frames of a track share is what they have in common.
+    The most probable ones for normal errors of which each track counts once, with a normal prior about the power given
+    (`PRIOR_SHARE`) and limits. The usual bound is the geometric mean. Variances are those of n tracks of which one is
+    lost to the height: errors of a track repeat, and the height was fitted to these tracks.
+    """
+    known = np.isfinite(error).all(axis=1) & np.isfinite(bound).all(axis=1)
+    error, bound, (_, track) = error[known], bound[known], np.unique(track_of[known], return_inverse=True)
+    once, tracks = 1.0 / np.bincount(track)[track], max(int(track.max()) + 1, 2)
+    usual = np.exp(np.average(np.log(bound), axis=0, weights=once))
+    growth, tiny = np.log(bound / usual), np.finfo(float).tiny
+
+    def variances(power: float) -> Floats:
+        return np.asarray(np.average(error**2 * np.exp(-2 * power * growth), axis=0, weights=once))
+
+    def loss(power: float) -> float:
+        off = (power - prior_power) / (PRIOR_SHARE * prior_power)
+        return float(0.5 * off**2 + 0.5 * tracks * np.log(np.maximum(variances(power), tiny)).sum())
+
+    power = float(minimize_scalar(loss, bounds=powers, method="bounded").x)
+    return usual, np.sqrt(variances(power) * tracks / (tracks - 1)), power
+
+
+def report_interval_s(error: Floats, track_of: Ints, stamp_ns: Ints, prior_s: float) -> float:
+    """Time in which a track tells as much of a place as one independent frame (`Confusion.report_interval_s`).
+
+    Of errors in sigmas. The mean of a track has the variance c, the mean product of the errors of different frames; 1 /
+    c independent frames would have it. A track of T seconds is worth one of them in c T: the mean over tracks and both
+    coordinates. The given time counts as some tracks (`PRIOR_SHARE`), and c is at least 0.
     """
     known = np.isfinite(error).all(axis=1)
-    products, squares = np.zeros(2), np.zeros(2)
+    seconds, tracks = prior_s / PRIOR_SHARE**2, 1 / PRIOR_SHARE**2
     for track in np.unique(track_of[known]):
-        own = error[known & (track_of == track)]
-        products += (own[1:] * own[:-1]).sum(axis=0)
-        squares += 0.5 * (own[1:] ** 2 + own[:-1] ** 2).sum(axis=0)
-    return float(np.clip(np.mean(products / np.maximum(squares, np.finfo(float).tiny)), 0.0, MOST_CORRELATED))
+        own, stamps = error[known & (track_of == track)], stamp_ns[known & (track_of == track)]
+        n = len(own)
+        if n > 1:
+            common = (own.sum(axis=0) ** 2 - (own**2).sum(axis=0)) / (n * (n - 1))
+            seconds, tracks = seconds + float(common.mean() * np.ptp(stamps) * 1e-9), tracks + 1
+    return max(seconds / tracks, 0.0)
 
 
 def confusion_rows(scores: Floats, label: Ints, trials: Ints) -> Floats:

@@ -84,12 +84,23 @@ class Labels(Section):
 
 
 def read_labels(path: Path, log: Path) -> Labels:
-    """Read labels of a log from a JSON or CSV file.
+    r"""Read labels of a log from a JSON or CSV file.
 
     Raises
     ------
     CalibrationError
         When the file cannot be read, is neither, has a field that does not fit, or is of another log.
+
+    Examples
+    --------
+    A landmark, and something that is none:
+
+    >>> from pathlib import Path
+    >>> from sonar_graph.recognition import read_labels
+    >>> text = "stamp_ns,range_m,azimuth_rad,id\n1000000000,1.62,0.05,1\n2000000000,1.70,-0.10,\n"
+    >>> written = Path("labels.csv").write_text(text)
+    >>> [label.id for label in read_labels(Path("labels.csv"), Path("dive.mcap")).labels]
+    [1, None]
     """
     try:
         text = text_of(path, "utf-8-sig")  # spreadsheets begin their CSV with a byte-order mark
@@ -121,8 +132,8 @@ def _from_csv(text: str, log: Path) -> dict[str, object]:
 class LabelledTrack:
     """Sightings of a track with the sonar's pose at each, and the labels that it met, all in one frame at rest."""
 
-    sightings: list[tuple[gtsam.Pose3, ObjectSighting, float]] = field(default_factory=list)
-    """With the independent share of the frame."""
+    sightings: list[tuple[int, gtsam.Pose3, ObjectSighting, float]] = field(default_factory=list)
+    """Each after its stamp and the pose of the sonar, with the independent share of the frame."""
     seen: list[Floats] = field(default_factory=list)
     """Places of the sightings."""
     ids: set[int | None] = field(default_factory=set)
@@ -206,9 +217,9 @@ def calibrate_by_labels(
         for number, track in sure.items():
             (landmark,) = track.ids
             place = track.middle() + share * track.off()
-            for world_T_sonar, sighting, news in track.sightings:
+            for stamp_ns, world_T_sonar, sighting, news in track.sightings:
                 truth = NOWHERE if landmark is None else _seen_from(world_T_sonar, place, landmark)
-                gathered.add(sighting, (log, number), news, *truth)
+                gathered.add(sighting, stamp_ns, (log, number), news, *truth)
     try:
         return estimate_confusion(gathered.fits(), gathered.ids, provenance, designs)
     except CalibrationError as error:
@@ -252,7 +263,7 @@ def _labelled_tracks(
             if sighting is None:
                 continue
             seen[number] = sighting
-            tracks[number].sightings.append((session.start_T_sonar, sighting, news))
+            tracks[number].sightings.append((stamp_ns, session.start_T_sonar, sighting, news))
             tracks[number].seen.append(place_of(sighting.range_m, sighting.azimuth_rad, session))
         for row, label in by_stamp.pop(stamp_ns, []):
             away = {number: _distance(sighting, label) for number, sighting in seen.items()}

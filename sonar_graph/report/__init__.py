@@ -1,13 +1,20 @@
 """Reports: pages, tables and terminal texts about comparisons and batches."""
 
 # fmt: off
-from sonar_graph.report.batch_page import write_batch_report
-from sonar_graph.report.batch_summary import lost_told, missing_told
-from sonar_graph.report.comparison_page import write_page, write_report
-from sonar_graph.report.console import published_counterpart, summary
-from sonar_graph.report.rendering import render
+from typing import TYPE_CHECKING
+from sonar_graph import at_first_use
+
+if TYPE_CHECKING:
+    from sonar_graph.report.batch_page import write_batch_report
+    from sonar_graph.report.batch_summary import lost_told, missing_told
+    from sonar_graph.report.comparison_page import write_page, write_report
+    from sonar_graph.report.console import published_counterpart, summary
+    from sonar_graph.report.paper import write_paper
+    from sonar_graph.report.rendering import render
+else:
+    __getattr__ = at_first_use(__name__)
 
 __all__ = [
     "lost_told", "missing_told", "published_counterpart", "render", "summary", "write_batch_report", "write_page",
-    "write_report",
+    "write_paper", "write_report",
 ]

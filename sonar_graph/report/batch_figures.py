@@ -17,7 +17,7 @@ from sonar_graph.report import figure_style as style
 from sonar_graph.report.batch_tables import SAME_EVIDENCE, Tests, anees_of, is_evidence, unit_of
 from sonar_graph.report.rendering import csv_text
 
-ROW_IN, PANEL_IN, WIDTH_IN = 0.36, 0.95, 7.4
+ROW_IN, PANEL_IN = 0.36, 0.95
 STACKED = 2
 """Largest number of logs below each other; more make small multiples."""
 MOST_COLUMNS = 3
@@ -37,7 +37,8 @@ def log_panels(batch: RecordedBatch, logs: list[str], x_label: str) -> tuple[Fig
     columns = 1 if len(logs) <= STACKED else min(MOST_COLUMNS, len(logs) - 1)
     rows = -(-len(logs) // columns)
     height_in = rows * (PANEL_IN + ROW_IN * len(names))
-    figure, axes = style.blank_panels(rows, columns, (WIDTH_IN, height_in))
+    figure, axes = style.blank_panels(rows, columns, (style.width_in(), height_in))
+    figure.set_layout_engine("constrained")  # names of any width stand beside the panels
     panels: list[Axes] = list(axes.flat)
     for panel in panels[len(logs) :]:
         panel.remove()
@@ -51,7 +52,7 @@ def log_panels(batch: RecordedBatch, logs: list[str], x_label: str) -> tuple[Fig
             label.set_color(style.colour(place))
             label.set_linespacing(0.95)
         style.head_panel(panel, folded(log, HEADING_LETTERS) if narrow else log)
-    figure.supxlabel(x_label, color=style.INK, fontsize=style.LABEL_SIZE)
+    figure.supxlabel(x_label, color=style.INK, fontsize="medium")
     return figure, panels[: len(logs)]
 
 
@@ -225,9 +226,7 @@ def _draw_spread(panel: Axes, values: Floats, place: int, over: str) -> None:
         panel.plot(middle, row, "|", color=style.INK, markersize=12, markeredgewidth=1.6)
     if len(known) < len(values):
         across, note = panel.get_yaxis_transform(), f"{len(values) - len(known)} without"
-        panel.text(
-            1.01, row, note, transform=across, ha="left", va="center", color=style.MUTED, fontsize=style.TICK_SIZE - 1
-        )
+        panel.text(1.01, row, note, transform=across, ha="left", va="center", color=style.MUTED, fontsize="small")
 
 
 def _draw_interval(panel: Axes, ends: Floats, place: int, over: str) -> None:
@@ -262,4 +261,4 @@ def _text(value: float) -> str:
 def _drawn(figure: Figure, name: str, title: str, caption: str, rows: Rows) -> style.Illustration:
     plain_name = name.replace("_", "-").replace(".", "-")
     svg = style.inline_svg(figure, plain_name, f"{title}. {caption}")
-    return style.Illustration(plain_name, title, caption, svg, data=csv_text(rows))
+    return style.Illustration(plain_name, title, caption, svg, data=csv_text(rows), figure=figure)

@@ -10,6 +10,7 @@ from sonar_graph.files import BATCH, replacing, result_written
 from sonar_graph.report import batch_figures as figures
 from sonar_graph.report import batch_summary as summary
 from sonar_graph.report import batch_tables as tables
+from sonar_graph.report.figure_style import sized
 from sonar_graph.report.rendering import render, write_tables
 
 FOLDED_ROWS = 24
@@ -32,7 +33,8 @@ def write_batch_report(batch: RecordedBatch, folder: Path, *, overwrite: bool = 
     -------
     Path of the page.
     """
-    content = _content(batch)
+    with sized():
+        content = batch_content(batch)
     with result_written(folder, BATCH, overwrite=overwrite):
         write_tables(content["tables"], folder)
         with replacing(folder / PAGE) as partial:
@@ -42,10 +44,11 @@ def write_batch_report(batch: RecordedBatch, folder: Path, *, overwrite: bool = 
 
 def render_batch(batch: RecordedBatch) -> str:
     """The page as text."""
-    return render(TEMPLATE, _content(batch))
+    with sized():
+        return render(TEMPLATE, batch_content(batch))
 
 
-def _content(batch: RecordedBatch) -> dict[str, Any]:
+def batch_content(batch: RecordedBatch) -> dict[str, Any]:
     """Values by the names that the template uses."""
     metrics = metrics_of(batch.metrics)
     tests = tables.all_tests(batch, metrics)
@@ -83,7 +86,7 @@ def _content(batch: RecordedBatch) -> dict[str, Any]:
             f"{len(batch.runs)} runs of {len(batch.contestants)} estimators on {len(batch.logs)} logs, up to {seeds} "
             f"seed{'s' * (seeds != 1)} each, compared with {batch.reference}."
         ),
-        "failed": [*summary.missing_told(batch), *summary.failures_told(batch)],
+        "failed": [*summary.missing_told(batch), *summary.absent_told(batch), *summary.failures_told(batch)],
         "warnings": [*summary.reference_told(batch), *summary.instants_told(batch), *summary.power_told(tests)],
         "headlines": summary.headlines(batch, head, tests) if head else [],
         "overview": overview[0] if overview else None,

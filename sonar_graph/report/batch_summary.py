@@ -21,8 +21,9 @@ from sonar_graph.batch import (
     quantile_error,
     summarise,
 )
-from sonar_graph.evaluation import Cell, Column, Table, absent, number, quantile_text, words
+from sonar_graph.evaluation import quantile_text
 from sonar_graph.report.batch_tables import GROUP_COLUMNS, SIGNIFICANT, Tests, p_text, unit_of
+from sonar_graph.table import Cell, Column, Table, absent, number, words
 
 SCORED = "scored_instants"
 NAMED = 3
@@ -248,6 +249,11 @@ def missing_told(batch: RecordedBatch) -> list[str]:
         f"This batch is not complete: {batch.missing_count} ({whose}), on {logs}. All numbers "
         f"are of the other runs, and may change. To complete it, {GOING_ON}."
     ]
+
+
+def absent_told(batch: RecordedBatch) -> list[str]:
+    """The logs that were left out because their data was not there, and where it is from."""
+    return [f"Left out, because its data was not there: {name}. Get {source}." for name, source in batch.absent.items()]
 
 
 def lost_told(batch: RecordedBatch) -> list[str]:

@@ -26,19 +26,13 @@ from sonar_graph.batch import (
     summarise,
 )
 from sonar_graph.evaluation import (
-    Cell,
-    Column,
-    Table,
-    absent,
     between,
-    count,
     format_value,
-    number,
     quantile_text,
     supported,
     with_error,
-    words,
 )
+from sonar_graph.table import Cell, Column, Table, absent, count, number, words
 
 SIGNIFICANT = 0.05
 Tests = dict[tuple[str, str, str], tuple[PairedDifference, float]]

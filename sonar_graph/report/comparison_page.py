@@ -14,15 +14,11 @@ from numpy.typing import NDArray
 
 from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation import (
-    ABSENT,
-    DURATION_S,
-    MAP_TIMES_S,
     NONE,
     UNJUDGED,
-    Column,
     Comparison,
     Ensemble,
-    Table,
+    compact_table,
     confidences,
     format_value,
     reliability_of,
@@ -30,23 +26,21 @@ from sonar_graph.evaluation import (
     run_columns,
     score_keys,
     score_table,
-    text_table,
     true_identities,
-    words,
     write_comparison,
     write_viewer_files,
 )
 from sonar_graph.files import COMPARISON, replacing, result_written
 from sonar_graph.logs import PICTURES
-from sonar_graph.recognition import SURE
-from sonar_graph.report import figures, sentences
+from sonar_graph.report import sentences
 from sonar_graph.report.ensemble_section import ensemble_figure, ensemble_sentences, ensemble_table
-from sonar_graph.report.figure_style import Illustration, inline_svg
+from sonar_graph.report.figure_style import Illustration, inline_svg, sized
+from sonar_graph.report.figures import illustrations, reliability_figure
 from sonar_graph.report.landmark_table import PAPER, landmark_table, landmarks_left_out
-from sonar_graph.report.maps import enlargement, growth_figure, map_figure, paths_cut_off
 from sonar_graph.report.rendering import data_address, render
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import Outcome
+from sonar_graph.table import ABSENT, Column, Table, text_table, words
 
 PAGE, TEMPLATE = "report.html", "comparison.html"
 RUN_FILES = {
@@ -112,6 +106,17 @@ def write_page(comparison: Comparison, folder: Path) -> Path:
 
     The page needs nothing but itself: figures are inline SVG in the page's colours, style is inline, there is no
     script. Links lead to the files beside it (``comparison.json``, ``result.mcap``, ``runs/NAME/``).
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> from sonar_graph import compare
+    >>> from sonar_graph.report import write_page
+    >>> from sonar_graph.testing import small_world
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_page(compare(small_world(), ["dead-reckoning"]), Path(folder)).name
+    'report.html'
     """
     with result_written(folder, COMPARISON), replacing(folder / PAGE) as partial:
         partial.write_text(render_report(comparison), encoding="utf-8")
@@ -123,6 +128,8 @@ def render_report(comparison: Comparison) -> str:
     sequence, runs = comparison.sequence, comparison.runs
     is_repeated, failed = repeats_published(sequence), comparison.failed_runs
     detections = len(sequence.detections) if sequence.detections else 0
+    lost = sentences.lost_runs(comparison)
+    told = [sentence for sentence in sentences.finding(comparison)[len(failed) :] if sentence not in lost]
     content = {
         "name": sequence.name,
         "names": [run.estimator for run in runs],
@@ -138,8 +145,11 @@ def render_report(comparison: Comparison) -> str:
             (ensemble_table(one, f"runs-{place}"), ensemble_illustration(one, f"runs-{place}"))
             for place, one in enumerate(comparison.ensembles, start=1)
         ],
-        "finding": sentences.finding(comparison),
+        "headline": sentences.headline(comparison) or told[0],
+        "finding": told,
         "doubts": [
+            *sentences.finding(comparison)[: len(failed)],
+            *lost,
             *sentences.warning_lines(sequence.notes),
             *sentences.doubt_of_identities(comparison),
             *sentences.outliers(comparison),
@@ -152,6 +162,7 @@ def render_report(comparison: Comparison) -> str:
             [[run.estimator, run.reason] for run in failed],
             numbers=False,
         ),
+        "compact": compact_table(comparison),
         "scores": score_table(comparison),
         "protocols": protocols(comparison),
         "figures": illustrations(comparison),
@@ -180,6 +191,14 @@ def render_report(comparison: Comparison) -> str:
     return render(TEMPLATE, content)
 
 
+def comparison_tables(comparison: Comparison) -> list[Table]:
+    """All tables of numbers that the page has, but the compact one."""
+    landmarks = landmark_table(comparison)
+    tables = [score_table(comparison), *([landmarks] if landmarks else []), outcome_table(comparison)]
+    tables += [ensemble_table(one, f"runs-{place}") for place, one in enumerate(comparison.ensembles, start=1)]
+    return [table for table in [*tables, refused_table(comparison)] if table.rows]
+
+
 def ensemble_illustration(ensemble: Ensemble, name: str) -> Illustration:
     """The figure of many runs."""
     title = "Error and consistency over time"
@@ -188,7 +207,8 @@ def ensemble_illustration(ensemble: Ensemble, name: str) -> Illustration:
         f"80 % of {len(ensemble.seeds)} runs. Below: their average NEES; the grey band holds 95 % of consistent "
         "estimators."
     )
-    figure = ensemble_figure(ensemble)
+    with sized():
+        figure = ensemble_figure(ensemble)
     svg = "" if figure is None else inline_svg(figure, name, f"{title}. {caption}")
     return Illustration(name, title, caption, svg, "No run came to an end.")
 
@@ -263,6 +283,8 @@ def recognition_content(comparison: Comparison) -> dict[str, Any] | None:
     found, sequence = comparison.recognition, comparison.sequence
     if found is None:
         return None
+    from sonar_graph.recognition import SURE  # a recogniser takes a while to load, and most logs have detections
+
     start_ns, judged = sequence.start_ns, reliability_of(sequence)
     pictures = []
     for picture in found.shown():
@@ -276,7 +298,8 @@ def recognition_content(comparison: Comparison) -> dict[str, Any] | None:
             f"Reliability of identity posteriors: expected calibration error {judged.expected_error:.3f} over "
             f"{judged.count.sum()} detections."
         )
-        reliability = inline_svg(figures.reliability_figure(judged), "reliability", description)
+        with sized():
+            reliability = inline_svg(reliability_figure(judged), "reliability", description)
     return {
         "frames": found.frames,
         "detections": 0 if sequence.detections is None else len(sequence.detections),
@@ -328,94 +351,3 @@ def naming_table(sequence: Sequence) -> Table | None:
         rows.append(["cannot be told", ABSENT, *counted(labels == UNJUDGED)])
     title = "What detections truly are, and what was most probable for the recogniser"
     return text_table("naming", title, ["Truly", "named rightly", "named wrongly", "taken for no landmark"], rows)
-
-
-FIGURES = {
-    "map": ("Map", map_figure, "", "No run has a path to draw.", ()),
-    "growth": ("Map as it grew", growth_figure, "", "No run kept its map on the way.", ()),
-    "errors": (
-        *("Error over time", figures.error_figure),
-        "Estimate minus truth of the causal estimates, not aligned. The shaded band is three reported standard "
-        "deviations either side: a consistent estimator leaves it almost never. Each panel has its own scale.",
-        *("{no_errors}", ("causal.ate_raw_m", "causal.yaw_rmse_rad")),
-    ),
-    "own_map": (
-        *("Where am I on my map?", figures.own_map_figure),
-        "Horizontal error of the causal position after the map, as the estimator had it at that instant, is aligned "
-        "to the true landmarks. A smoother that moves its map when it learns moves itself with it: the path told "
-        "before is left behind, and only the other errors count that.",
-        *("No run has a map of three true landmarks while the truth is known.", ("causal.own_map_m",)),
-    ),
-    "yaw": ("Yaw over time", figures.yaw_figure, "", "No run has a path to draw.", ("causal.yaw_rmse_rad",)),
-    "nees": (
-        *("Consistency over time", figures.nees_figure),
-        "Normalised estimation error squared (NEES) of the causal estimates, divided by its degrees of freedom. "
-        "Dots are instants, the line is the mean over a fortieth of the run; 1 is consistent. The band holds 95 % "
-        "of a consistent estimator's values. Instants of one run depend on each other, so a share near 95 % is a "
-        "hint and not a test.",
-        *("{no_errors} NEES needs them.", ("causal.nees_position", "causal.nees_yaw")),
-    ),
-    "innovations": (
-        *("Innovations over time", figures.innovation_figure),
-        "Measured minus predicted range and azimuth of detections that had a prediction; in long runs an even "
-        "choice of them, with the extremes.",
-        *("No run reports innovations.", ()),
-    ),
-    "nis": (
-        *("Distribution of NIS", figures.nis_figure),
-        "Normalised innovation squared (NIS) of used detections. Right of the grey curve: innovations larger than "
-        "predicted; left: smaller.",
-        *("No run reports innovations with their covariances.", ("detections.nis",)),
-    ),
-    "timing": (
-        *("Time per update", figures.timing_figure),
-        "Share of updates that took at most the given time; dots mark the median and the 99th percentile.",
-        *("No run reports durations.", ("time.update_median_ms", "time.update_p99_ms")),
-    ),
-}
-"""Figures in reading order: title, function, caption, sentence where there is nothing to draw, scores to read out."""
-
-
-def illustrations(comparison: Comparison) -> dict[str, Illustration]:
-    """All figures of the page by name, in reading order: headings, captions, and descriptions that can be read out."""
-    is_repeated = repeats_published(comparison.sequence)
-    counterpart = " The counterpart of {} of the 2014 paper." if is_repeated else ""
-    no_errors = "No run has errors against the ground truth."
-    if comparison.sequence.truth is None:
-        no_errors = "The log has no ground truth, so there are no errors to draw."
-    gone = paths_cut_off(comparison)
-    factor = enlargement(comparison)
-    growth = (
-        "Causal paths until the time T since start, and the landmarks as each estimator knew them then, not aligned. "
-        f"Ellipses hold 95 %{'' if factor == 1 else f', drawn {factor} times as large'}."
-        f"{counterpart.format('Fig. 4')}"
-    )
-    if is_repeated:
-        *others, last = (f"{time_s:.1f}" for time_s in MAP_TIMES_S)
-        if abs(comparison.sequence.duration_s - DURATION_S) < 1:
-            growth += f" T are the instants nearest to its {', '.join(others)} and {last} s."
-        else:
-            growth += (
-                f" T are the same fractions of this run as its {', '.join(others)} and {last} s of {DURATION_S:.1f} s."
-            )
-    captions = {
-        "map": (
-            "Paths and landmarks in the world of the start pose, not aligned. Ellipses hold 95 % of where each "
-            "estimator believes a landmark to be; numbers are landmark IDs. Smoothed paths are drawn where they differ."
-            + (f" Leaves the picture: {', '.join(gone)}." if gone else "")
-        ),
-        "growth": growth,
-        "yaw": f"Heading of the body's x axis, wrapped to ±180°, causal.{counterpart.format('Fig. 5')}",
-    }
-    found = {}
-    for name, (title, draw, caption, instead, keys) in FIGURES.items():
-        told = []  # the figure's numbers, run by run, for a reader who does not see it
-        for run in comparison.runs:
-            scores = [score for key in keys if (score := comparison.score_of(run.estimator, key))]
-            if scores:
-                told.append(f"{run.estimator}: {' and '.join(score.with_unit for score in scores)}")
-        numbers = " ".join(sentences.finding(comparison)) if name == "map" else f"{'; '.join(told)}." if told else ""
-        figure, told_caption = draw(comparison), captions.get(name, caption)
-        svg = "" if figure is None else inline_svg(figure, name, f"{title}. {told_caption} {numbers}".strip())
-        found[name] = Illustration(name, title, told_caption, svg, instead.format(no_errors=no_errors))
-    return found

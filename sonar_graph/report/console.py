@@ -5,10 +5,11 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from sonar_graph.evaluation import ABSENT, LABELS, Comparison, repeats_published, score_keys
+from sonar_graph.evaluation import Comparison, headline_metric, label, repeats_published, score_keys
 from sonar_graph.report import sentences
 from sonar_graph.report.ensemble_section import ensemble_sentences
 from sonar_graph.report.landmark_table import PAPER, landmark_table
+from sonar_graph.table import ABSENT
 
 COLUMNS = {
     "causal.own_map_m": "on own\nmap",
@@ -46,7 +47,7 @@ def summary(comparison: Comparison) -> Group:
     The numbers are those of the report. NEES is 1 for a consistent estimator and marked by `Score.verdict`. The lines
     below the table may be as wide as the terminal.
     """
-    metric = sentences.headline_metric(comparison)
+    metric = headline_metric(comparison)
     errors = {f"causal.{metric}": "causal", f"smoothed.{metric}": "smoothed"} if metric else {}
     present = score_keys(comparison)
     mapped = {} if metric else {"landmarks.se2_m": "map"}
@@ -87,11 +88,11 @@ def _lines_below(comparison: Comparison, metric: str | None) -> list[str]:
     if not has_detections:
         lines.append(sentences.no_detections(comparison))
     if metric is None:
-        mapped = f"map: {LABELS['se2_m']}" if "landmarks.se2_m" in score_keys(comparison) else ""
+        mapped = f"map: {label('se2_m', comparison)}" if "landmarks.se2_m" in score_keys(comparison) else ""
         why = comparison.environment["scored instants"].removeprefix("none: ")
         return [*lines, *filter(None, [mapped]), f"No position errors: {why}"]
-    lines += [f"causal, smoothed: {LABELS[metric]}"]
-    lines += [f"on own map: {LABELS['own_map_m']}"] if "causal.own_map_m" in score_keys(comparison) else []
+    lines += [f"causal, smoothed: {label(metric, comparison)}"]
+    lines += [f"on own map: {label('own_map_m', comparison)}"] if "causal.own_map_m" in score_keys(comparison) else []
     lines.append(NEES_LEGEND)
     for name in (run.estimator for run in comparison.runs):
         score = comparison.score_of(name, "causal.nees_position")

@@ -4,13 +4,20 @@ The mean of the final errors has its 95 % interval (Hall 1992), the ANEES at an 
 independent runs. Equations: docs/theory/metrics.md, docs/theory/batch_statistics.md.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 from matplotlib.figure import Figure
 
-from sonar_graph.batch import Anees, anees, paired
-from sonar_graph.evaluation import Column, Ensemble, Table, absent, anees_interval, format_value, number, words
+from sonar_graph.evaluation import Ensemble, anees_interval, format_value
 from sonar_graph.measurements import Floats
 from sonar_graph.report import figure_style as style
+from sonar_graph.table import Column, Table, absent, number, words
+
+if TYPE_CHECKING:
+    from sonar_graph.batch import Anees
 
 HEADLINE = "causal.ate_se2_m"
 SHOWN = {
@@ -33,6 +40,8 @@ LOW, HIGH = 0.1, 0.9
 
 def mean_text(values: Floats) -> str:
     """Mean of the runs with its 95 % interval, metres; the number of runs without a value where there are any."""
+    from sonar_graph.batch import paired  # loads the simulators, which one comparison does not need
+
     lost = int(np.isinf(values).sum())
     if lost:
         return f"{lost} of {len(values)} runs without"
@@ -92,13 +101,15 @@ def ensemble_table(ensemble: Ensemble, name: str) -> Table:
 
 def anees_at_end(ensemble: Ensemble, estimator: str, what: str, dof: int) -> Anees:
     """Average over the runs, each at its last scored instant."""
+    from sonar_graph.batch import anees
+
     runs = [np.array(run or [], dtype=float) for run in ensemble.nees[estimator][what]]
     return anees(np.array([known[-1] if len(known := run[~np.isnan(run)]) else np.inf for run in runs]), dof)
 
 
 def ensemble_figure(ensemble: Ensemble) -> Figure | None:
     """Position error over time, mean and middle 80 % of the runs, and ANEES over the runs with its 95 % band."""
-    figure, axes = style.blank_panels(2, 1, (7.4, 4.8), sharex=True)
+    figure, axes = style.blank_panels(2, 1, (style.width_in(), 4.8), sharex=True)
     errors, consistency = axes[:, 0]
     least, most = np.inf, 0.0
     for index, name in enumerate(ensemble.values):

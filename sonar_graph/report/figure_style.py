@@ -1,8 +1,14 @@
-"""The style of all figures: colours, panels, thinning of long series, and inline SVG in the colours of the page."""
+"""The style of all figures: colours, sizes, panels, margins, thinning of long series, and inline SVG for pages.
+
+Widths and sizes of text are matplotlib's own settings while a figure is drawn (`sized`), so that the same functions
+draw for a page and for a paper.
+"""
 
 import html
 import io
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Literal
@@ -10,8 +16,12 @@ from typing import Any, Literal
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, NullFormatter
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path as MarkPath
+from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
+from matplotlib.transforms import ScaledTranslation
 from numpy.typing import NDArray
 
 from sonar_graph.evaluation import Comparison
@@ -24,9 +34,17 @@ TRUTH = "#8b9198"
 ESTIMATOR_COLOURS = ("#0072b2", "#d55e00", "#00805e", "#a8508a", "#7a6a00", "#5b53b0")
 """After Okabe and Ito, told apart with any colour vision; darkened where white paper asks for more contrast."""
 LINE_STYLES: tuple[Any, ...] = ("-", (0, (5, 1.6)), (0, (4, 1.4, 1, 1.4)), (0, (1.2, 1.2)))
-LABEL_SIZE, TICK_SIZE = 9.5, 9.0
+TIME_LABEL = "time since start (s)"
+PAGE_WIDTH_IN, PAGE_TEXT_PT = 7.4, 9.2
 SERIES_POINTS = 700
 """Points that a drawn series keeps: more cannot be seen at the width of a page."""
+LETTERS = {"STIXGeneral": 0.48}
+LETTER, LINE, LEGEND_LINE = 0.62, 1.3, 1.5
+"""Mean width of a letter (in `LETTERS` by font) and distance of lines, in sizes of the text."""
+TICK_IN, EDGE_IN, GAP_IN, HANDLE_IN = 0.13, 0.1, 0.16, 0.6
+"""A tick with its distance to the number, the outer margin, the gap between panels, a line in the legend, inches."""
+SHAPES = (0.45, 1.25)
+"""Lowest and highest panel of a map, in its widths."""
 PAGE_COLOURS = {INK: "--ink", MUTED: "--muted", RULE: "--rule", TRUTH: "--truth"} | {
     own: f"--run-{index}" for index, own in enumerate(ESTIMATOR_COLOURS)
 }
@@ -48,6 +66,7 @@ class Illustration:
     """Sentence in place of the caption where there is nothing to draw."""
     data: str = ""
     """The drawn values as CSV, in the units of the results."""
+    figure: Figure | None = None
 
 
 def colour(index: int) -> str:
@@ -60,30 +79,130 @@ def line_style(index: int) -> Any:
     return LINE_STYLES[index % len(LINE_STYLES)]
 
 
+@contextmanager
+def sized(width_in: float = PAGE_WIDTH_IN, text_pt: float = PAGE_TEXT_PT, font: str = "sans-serif") -> Iterator[None]:
+    """Let all figures that are drawn in the block have this width and size of text."""
+    settings: Any = {"figure.figsize": (width_in, width_in), "font.size": text_pt, "font.family": font}
+    for text in ("axes.labelsize", "axes.titlesize", "xtick.labelsize", "ytick.labelsize", "legend.fontsize"):
+        settings[text] = "medium"
+    with mpl.rc_context(settings):
+        yield
+
+
+def width_in() -> float:
+    """Width of figures, as the block of `sized` says."""
+    return float(mpl.rcParams["figure.figsize"][0])
+
+
+def text_pt() -> float:
+    """Size of text, as the block of `sized` says."""
+    return float(mpl.rcParams["font.size"])
+
+
+def size_in(rows: int, row_in: float = 1.75) -> tuple[float, float]:
+    """Width and height of a figure of rows, inches; on a narrow one they are lower."""
+    narrow = min(1.0, 0.4 + 0.6 * width_in() / PAGE_WIDTH_IN)
+    return width_in(), ((row_in if rows > 1 else 2.3) * rows + 0.8) * narrow
+
+
 def blank_panels(rows: int, columns: int, size_in: tuple[float, float], **sharing: Any) -> tuple[Figure, NDArray[Any]]:
     """A figure of styled, empty panels, shape (rows, columns), without any state of pyplot."""
-    figure = Figure(figsize=size_in, layout="constrained", facecolor="none")
+    figure = Figure(figsize=size_in, facecolor="none")
     axes = figure.subplots(rows, columns, squeeze=False, **sharing)
     for panel in axes.flat:
         panel.set_facecolor("none")
         panel.grid(True, color=RULE, linewidth=0.6)
         panel.set_axisbelow(True)
-        panel.tick_params(which="both", color=RULE, labelcolor=MUTED, labelsize=TICK_SIZE)
+        panel.tick_params(which="both", color=RULE, labelcolor=MUTED)
+        for axis, most in ((panel.xaxis, 8 if columns == 1 else 5), (panel.yaxis, 5)):
+            axis.set_major_locator(MaxNLocator(most, steps=[1, 2, 2.5, 5, 10]))
         for side, spine in panel.spines.items():
             spine.set_visible(side in ("left", "bottom"))
             spine.set_color(RULE)
     return figure, axes
 
 
+def arrange(figure: Figure) -> None:
+    """Set margins, places of labels and the height of maps, from what the figure holds.
+
+    What matplotlib's constrained layout does, in a fraction of its time: numbers at the ticks are counted in letters
+    instead of being drawn. A figure that has a layout engine keeps it.
+    """
+    if figure.get_layout_engine() is not None:
+        return
+    panels: list[Axes] = [panel for panel in figure.axes if panel.get_subplotspec() is not None]
+    grid = figure.axes[0].get_subplotspec().get_gridspec()  # type: ignore[union-attr]
+    width, height = map(float, figure.get_size_inches())
+    size = float(panels[0].xaxis.label.get_fontsize()) / POINTS_PER_INCH
+    line = LINE * size
+    letter = LETTERS.get(panels[0].xaxis.label.get_fontfamily()[0], LETTER) * size
+    titles = line if any(panel.get_title(loc="left") for panel in panels) else 0.0
+    labels = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+    above = -(-len(labels) // _legend_columns(width, labels, letter)) * LEGEND_LINE * size + (
+        EDGE_IN if labels else 0.0
+    )
+    numbers = {panel: TICK_IN + letter * _letters(panel) for panel in panels}
+    outer = [panel for panel in panels if panel.get_subplotspec().is_first_col()]  # type: ignore[union-attr]
+    inner = [panel for panel in panels if panel not in outer]
+    lines = max(panel.get_ylabel().count("\n") + 1 if panel.get_ylabel() else 0 for panel in panels)
+    left = EDGE_IN / 2 + line * lines + max(numbers[panel] for panel in outer)
+    across = GAP_IN + max((numbers[panel] for panel in inner if _has_numbers(panel.yaxis, "left")), default=0.0)
+    below = EDGE_IN / 2 + 2 * line + TICK_IN
+    is_stacked = any(
+        _has_numbers(panel.xaxis, "bottom")
+        for panel in panels
+        if not panel.get_subplotspec().is_last_row()  # type: ignore[union-attr]
+    )
+    down = GAP_IN + (2 * line + TICK_IN + titles if is_stacked else 0.0)
+    panel_width = (width - left - EDGE_IN - across * (grid.ncols - 1)) / grid.ncols
+    if panels[0].get_aspect() == 1:
+        (low, high), (bottom, top) = panels[0].get_xlim(), panels[0].get_ylim()
+        shape = float(np.clip((top - bottom) / (high - low), *SHAPES))
+        height = above + titles + EDGE_IN + below + grid.nrows * shape * panel_width + (grid.nrows - 1) * down
+        figure.set_size_inches(width, height)
+    panel_height = (height - above - titles - EDGE_IN - below - down * (grid.nrows - 1)) / grid.nrows
+    figure.subplots_adjust(
+        left=left / width,
+        right=1 - EDGE_IN / width,
+        bottom=below / height,
+        top=1 - (above + titles + EDGE_IN) / height,
+        wspace=across / panel_width,
+        hspace=down / panel_height,
+    )
+    for panel in panels:
+        beside = ScaledTranslation(-max(numbers[one] for one in outer), 0, figure.dpi_scale_trans)
+        under = ScaledTranslation(0, -TICK_IN - line, figure.dpi_scale_trans)
+        panel.yaxis.set_label_coords(0, 0.5, panel.transAxes + beside)
+        panel.xaxis.set_label_coords(0.5, 0, panel.transAxes + under)
+
+
+def _has_numbers(axis: Axis, side: str) -> bool:
+    """True where numbers stand at the ticks, which panels that share an axis do once."""
+    return bool(axis.get_tick_params(which="major").get(f"label{side}", True))
+
+
+def _legend_columns(width: float, labels: list[str], letter: float) -> int:
+    """Columns of a legend for which there is room; all in inches."""
+    return max(1, min(4, int(width / (HANDLE_IN + letter * max(map(len, labels), default=0)))))
+
+
+def _letters(panel: Axes) -> int:
+    """Letters of the longest number beside a panel."""
+    axis = panel.yaxis
+    low, high = sorted(panel.get_ylim())
+    shown = [place for place in axis.get_majorticklocs() if low <= place <= high]
+    return max(map(len, axis.get_major_formatter().format_ticks(shown)), default=0) if len(shown) else 0
+
+
 def name_axes(panel: Axes, x: str = "", y: str = "") -> None:
     """Label the axes; an empty label is left out."""
-    panel.set_xlabel(x, color=INK, fontsize=LABEL_SIZE)
-    panel.set_ylabel(y, color=INK, fontsize=LABEL_SIZE)
+    panel.set_xlabel(x, color=INK)
+    panel.set_ylabel(y, color=INK)
 
 
 def head_panel(panel: Axes, title: str, own_colour: str = INK) -> None:
     """Put a left-aligned heading over a panel."""
-    panel.set_title(title, loc="left", color=own_colour, fontsize=LABEL_SIZE, fontweight="bold")
+    panel.set_title(title, loc="left", color=own_colour, fontweight="bold", y=1.0, pad=4)
 
 
 def logarithmic(panel: Axes, direction: Literal["x", "y"]) -> None:
@@ -91,22 +210,37 @@ def logarithmic(panel: Axes, direction: Literal["x", "y"]) -> None:
     axis = panel.xaxis if direction == "x" else panel.yaxis
     panel.set(**{f"{direction}scale": "log"})
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_formatter(NullFormatter())
+    axis.set_minor_locator(NullLocator())
 
 
-def legend_above(figure: Figure, panel: Axes, columns: int = 4) -> None:
-    """One legend for the figure, outside the data."""
+def legend_above(figure: Figure, panel: Axes) -> None:
+    """One legend for the figure, outside the data, in as many columns as there is room for."""
     handles, labels = panel.get_legend_handles_labels()
+    letter = LETTERS.get(mpl.rcParams["font.family"][0], LETTER) * text_pt() / POINTS_PER_INCH
     figure.legend(
         handles,
         labels,
-        loc="outside upper left",
-        ncols=columns,
+        loc="upper left",
+        bbox_to_anchor=(0.0, 1.0),
+        borderaxespad=0.1,
+        ncols=_legend_columns(figure.get_figwidth(), labels, letter),
         frameon=False,
         labelcolor=INK,
-        fontsize=TICK_SIZE,
-        handlelength=2.6,
+        handlelength=2.4,
     )
+
+
+def dots(panel: Axes, x: Floats, y: Floats, own_colour: str, label: str = "") -> None:
+    """Dots as strokes without length: one element of the drawing, where each marker is one."""
+    points = np.column_stack([x, y])
+    path = MarkPath(np.repeat(points, 2, axis=0), [MarkPath.MOVETO, MarkPath.LINETO] * len(x))
+    path.should_simplify = False
+    look: dict[str, Any] = {"edgecolor": own_colour, "facecolor": "none", "linewidth": 2.0, "alpha": 0.5}
+    panel.add_artist(PathPatch(path, capstyle="round", transform=panel.transData, **look))
+    panel.update_datalim(points)
+    panel.autoscale_view()
+    if label:
+        panel.plot([], [], ".", color=own_colour, label=label)
 
 
 def seconds_since_start(comparison: Comparison, stamps_ns: Ints) -> Floats:
@@ -142,6 +276,7 @@ def inline_svg(figure: Figure, name: str, description: str) -> str:
 
     ``description``: content of the figure in words, for those who cannot see it.
     """
+    arrange(figure)
     buffer = io.StringIO()
     with mpl.rc_context({"svg.fonttype": "none", "path.simplify_threshold": 0.25, "svg.hashsalt": name}):
         figure.savefig(buffer, format="svg", metadata={"Date": None})

@@ -9,21 +9,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from sonar_graph.evaluation import (
-    ABSENT,
     RETURN_M,
-    Column,
     Comparison,
-    Table,
     fixed,
     landmark_errors,
     published_maps,
     repeats_published,
     rmse,
     scored_map,
-    words,
+    unaligned,
 )
 from sonar_graph.measurements import Floats
 from sonar_graph.states import LandmarkMap, Trajectory
+from sonar_graph.table import ABSENT, Column, Table, words
 
 PAPER = "2014 paper"
 MOST_LANDMARKS = 30
@@ -84,7 +82,7 @@ def landmark_table(comparison: Comparison) -> Table | None:
         errors = [None if one.landmarks is None else landmark_errors(one.landmarks, true) for one in columns.values()]
         raw = [fixed(rmse(e.horizontal_m), DECIMALS) if e else ABSENT for e in errors]
         aligned = [ABSENT if not e or np.isnan(e.aligned_rmse_m) else fixed(e.aligned_rmse_m, DECIMALS) for e in errors]
-        rows += [] if is_aligned else [["RMS, not aligned", "", *raw]]
+        rows += [] if is_aligned else [[f"RMS, {unaligned(comparison.sequence)}", "", *raw]]
         rows.append(["RMS after SE(2) alignment", "", *aligned])
         if repeats:
             rows += _return_rows(comparison.sequence.truth, [column.path for column in columns.values()])

@@ -13,8 +13,8 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup
 
-from sonar_graph.evaluation import Table, as_html
 from sonar_graph.files import replacing, spelt
+from sonar_graph.table import Table, as_html
 
 FOLDER = "tables"
 LATEX_SPECIAL = {

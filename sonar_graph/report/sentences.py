@@ -9,18 +9,22 @@ import math
 from collections.abc import Iterable, Mapping
 
 import numpy as np
-from scipy.stats import chi2
 
 from sonar_graph.evaluation import (
+    FITTED,
     GATED_SHARE,
+    HEADLINES,
     MOST_ROWS_NAMED,
     Comparison,
     RefusedRows,
     gathered,
+    headline_metric,
+    label,
     landmark_errors,
     normalised_squares,
     scored_map,
 )
+from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.settings import flattened
 from sonar_graph.states import FIRST_ANONYMOUS_ID, Outcome
 
@@ -28,14 +32,7 @@ TOO_CLOSE = 0.05
 """Relative difference below which one run says nothing about which of two errors is the smaller one."""
 CONSISTENCY_KEYS = {"position": "causal.nees_position", "yaw": "causal.nees_yaw"}
 NO_DETECTIONS = "The log has no landmark detections; without them nothing corrects the drift."
-HEADLINES = {
-    "ate_se2_m": "RMS after SE(2) alignment",
-    "ate_se3_m": "RMS after SE(3) alignment",
-    "ate_yaw_m": "RMS after alignment of yaw and translation",
-    "ate_raw_m": "RMS, not aligned",
-}
-"""Position errors that can stand in the headline, best suited first, with their names there."""
-ABSURD = float(chi2.ppf(1 - 1e-9, 2))
+ABSURD = chi_square_quantile(1 - 1e-9, 2)
 """41.4: the chi-square quantile of two degrees of freedom at 1 - 1e-9."""
 CONTRADICTING_SHARE = 0.2
 """Above this share of innovations above `ABSURD` the sightings of a landmark contradict each other; below it they are
@@ -54,6 +51,7 @@ SAID_NOTES = {
     "log.ending": "Log",
     "log.damage": "Log",
     "log.start": "Log",
+    FITTED: "Truth",
     "log.stamps": "Log",
     "log.dropped": "Log, left out",
     "log.warnings": WARNING,
@@ -69,6 +67,9 @@ def finding(comparison: Comparison) -> list[str]:
     """
     runs = comparison.runs
     sentences = [f"{run.estimator} failed: {run.reason.rstrip('.')}." for run in comparison.failed_runs]
+    if FITTED in comparison.sequence.notes:
+        fitted = comparison.sequence.notes[FITTED]
+        sentences.append(f"{fitted[0].upper()}{fitted[1:]}.")
     if not comparison.sequence.detections:
         sentences.append(no_detections(comparison))
     sentences += lost_runs(comparison)
@@ -116,6 +117,36 @@ def finding(comparison: Comparison) -> list[str]:
     return sentences
 
 
+def headline(comparison: Comparison) -> str:
+    """One sentence: the estimator nearest to the truth, how far off it is, and what its covariances are worth.
+
+    Empty where no run has a position error: then `finding` begins with what can be said.
+    """
+    metric = headline_metric(comparison)
+    if metric is None:
+        return ""
+    errors = {run.estimator: comparison.score_of(run.estimator, f"causal.{metric}") for run in comparison.runs}
+    (name, least), *others = sorted(
+        ((name, score) for name, score in errors.items() if score), key=lambda item: item[1].value
+    )
+    close = [other for other, score in others if score.value > 0 and 1 - least.value / score.value < TOO_CLOSE]
+    equals = f", {' and '.join(close)} no farther than one run can tell" if close else ""
+    what = label(metric, comparison, HEADLINES)
+    opening = f"{name} is nearest to the truth{equals}: {least.with_unit} off ({what}, causal)"
+    if any(name in line for line in [*doubt_of_identities(comparison), *lost_runs(comparison)]):
+        return f"{opening}, but not to be believed before its warning is settled."
+    judged = {what: score for what, key in CONSISTENCY_KEYS.items() if (score := comparison.score_of(name, key))}
+    far = {what: score for what, score in judged.items() if score.verdict.startswith("over")}
+    if far:
+        listed = " and ".join(f"of {what} {score.text()}" for what, score in far.items())
+        is_small = any(score.verdict == "over-confident" for score in far.values())
+        told = "smaller than its errors: do not rely on them" if is_small else "larger than its errors"
+        return f"{opening}; its covariances are {told} (NEES {listed}, 1 fits)."
+    if any(score.verdict for score in judged.values()):
+        return f"{opening}; its covariances fit its errors."
+    return f"{opening}; whether its covariances fit, so short a run does not tell." if judged else f"{opening}."
+
+
 def _map_sentence(comparison: Comparison) -> str:
     """Errors of maps against true landmarks where no path is known; empty without any."""
     errors = {run.estimator: comparison.score_of(run.estimator, "landmarks.se2_m") for run in comparison.runs}
@@ -135,22 +166,12 @@ def no_detections(comparison: Comparison) -> str:
     return f"The part of the log that was chosen ({part}) has no landmark detections; nothing corrects the drift in it."
 
 
-def headline_metric(comparison: Comparison) -> str | None:
-    """The position error that most runs have, without its ``causal.`` or ``smoothed.``; None where no run has one."""
-    counts = {
-        metric: sum(comparison.score_of(run.estimator, f"causal.{metric}") is not None for run in comparison.runs)
-        for metric in HEADLINES
-    }
-    best = max(counts, key=lambda metric: counts[metric])
-    return best if counts[best] else None
-
-
 def _causal_sentence(comparison: Comparison, metric: str) -> str:
     """Causal errors in order of size, and the distance of the smallest from the others."""
     errors = {run.estimator: comparison.score_of(run.estimator, f"causal.{metric}") for run in comparison.runs}
     scored = sorted(((name, score) for name, score in errors.items() if score), key=lambda item: item[1].value)
     listed = ", ".join(f"{name} {score.with_unit}" for name, score in scored)
-    opening = f"Causal position error ({HEADLINES[metric]}): {listed}"
+    opening = f"Causal position error ({label(metric, comparison, HEADLINES)}): {listed}"
     if len(scored) == 1:
         return opening + "."
     (first, least), *others = scored

@@ -67,7 +67,15 @@ NOTES = {"truth": "exact: a quintic spline", "earth rotation": "neither simulate
 
 
 class BasinOptions(SimulationOptions):
-    """Options of the basin experiment."""
+    """Options of the basin experiment.
+
+    Examples
+    --------
+    >>> from sonar_graph.simulation import BasinOptions, simulate_basin
+    >>> options = BasinOptions(seed=3, duration_s=130.0, laps=1, wrong_id_rate=0.1)
+    >>> simulate_basin(options).true_landmarks.ids
+    array([1, 2, 3, 4])
+    """
 
     duration_s: float = Field(PAPER_DURATION_S, gt=0)
     """Of the whole run. The time that driving and turning leave is spent watching landmarks."""

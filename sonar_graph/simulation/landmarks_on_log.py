@@ -26,7 +26,14 @@ KNOT_S = 0.5
 
 
 class LandmarkOptions(Section):
-    """Options of landmarks and sonar on a recorded run."""
+    """Options of landmarks and sonar on a recorded run.
+
+    Examples
+    --------
+    >>> from sonar_graph.simulation import LandmarkOptions
+    >>> LandmarkOptions(spacing_m=10.0).seed
+    0
+    """
 
     seed: int = Field(0, ge=0)
     """Of everything random; equal options give equal bits."""
@@ -76,6 +83,14 @@ def add_landmarks(recorded: Sequence, options: LandmarkOptions | None = None) ->
     ------
     SimulationError
         When the log has no reference trajectory, too short a one, or ranges are the wrong way round.
+
+    Examples
+    --------
+    >>> from sonar_graph.simulation import LandmarkOptions, add_landmarks
+    >>> from sonar_graph.testing import aided_world
+    >>> seen = add_landmarks(aided_world(), LandmarkOptions(spacing_m=5.0, side_min_m=2.0))
+    >>> len(seen.true_landmarks) > 0
+    True
     """
     options = options or LandmarkOptions()
     for low, high in (("range_min_m", "range_max_m"), ("side_min_m", "side_max_m")):

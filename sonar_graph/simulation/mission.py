@@ -29,7 +29,14 @@ NOTES = {"ours": "everything: a synthetic mission", "truth": "exact: a quintic s
 
 
 class MissionOptions(SimulationOptions):
-    """Options of the mission."""
+    """Options of the mission.
+
+    Examples
+    --------
+    >>> from sonar_graph.simulation import MissionOptions, simulate_mission
+    >>> round(simulate_mission(MissionOptions(duration_s=60.0)).duration_s)
+    60
+    """
 
     duration_s: float = Field(2040.0, gt=5)
     """Of the whole run."""

@@ -37,7 +37,20 @@ MOST_LISTED = 12
 
 
 class Isam2Params(Section):
-    """Settings of the smoothing estimator."""
+    """Settings of the smoothing estimator.
+
+    Examples
+    --------
+    >>> from sonar_graph.slam import BoundedHistory, Isam2Params, MixtureIdentity
+    >>> params = Isam2Params(identity=MixtureIdentity(wrong_id_probability=0.1))
+    >>> params.identity.policy, params.keyframes.max_interval_s
+    ('max-mixture', 5.0)
+    >>> try:
+    ...     Isam2Params(identity=MixtureIdentity(), history=BoundedHistory())
+    ... except ValueError as error:
+    ...     print("max-mixture" in str(error))
+    True
+    """
 
     keyframes: KeyframeParams = KeyframeParams()
     """Where keyframes are set."""

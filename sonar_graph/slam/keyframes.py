@@ -37,7 +37,14 @@ EARLIEST_NS, LATEST_NS = np.iinfo(np.int64).min, np.iinfo(np.int64).max
 
 
 class KeyframeParams(Section):
-    """Settings of the keyframes."""
+    """Settings of the keyframes.
+
+    Examples
+    --------
+    >>> from sonar_graph.slam import Isam2Params, KeyframeParams
+    >>> Isam2Params(keyframes=KeyframeParams(max_interval_s=2.0)).keyframes.motion_noise_share
+    0.1
+    """
 
     max_interval_s: float = Field(5.0, gt=0)
     """Time since the last keyframe after which the next is due in any case."""

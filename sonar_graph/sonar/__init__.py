@@ -8,7 +8,7 @@ from sonar_graph.sonar.confusion import SHIPPED, Confusion, mark_of, posterior_m
 from sonar_graph.sonar.evidence import EVIDENCE
 from sonar_graph.sonar.geometry import Fan, FloorView, with_lens
 from sonar_graph.sonar.recogniser import REPORTED, Fate, Recogniser, RecogniserParams
-from sonar_graph.sonar.track_filter import SonarStep
+from sonar_graph.sonar.tracker import SonarStep
 
 __all__ = [
     "AcTagRecogniser", "AcTagSettings", "Confusion", "EVIDENCE", "Fan", "Fate", "FloorView", "IdentityParams",

@@ -26,7 +26,7 @@ from sonar_graph.measurements import Floats, LandmarkDetections
 from sonar_graph.sonar.frame_check import FrameCheck, check_block
 from sonar_graph.sonar.geometry import FloorView, points
 from sonar_graph.sonar.recogniser import REPORTED, Fate
-from sonar_graph.sonar.track_filter import SonarStep
+from sonar_graph.sonar.tracker import SonarStep
 
 INSTALL = "pip install 'sonar-graph[actag]'"
 BITS_OF_INNER_SQUARE = 3
@@ -38,7 +38,14 @@ SEED = 1
 
 
 class AcTagSettings(Section):
-    """Family of tags, and settings of AcTag."""
+    """Family of tags, and settings of AcTag.
+
+    Examples
+    --------
+    >>> from sonar_graph.sonar import AcTagSettings
+    >>> AcTagSettings(tag_size_m=0.2).family
+    'AcTag24h10'
+    """
 
     family: str = "AcTag24h10"
     """AcTag24h4, 24h6, 24h8 or 24h10: number of bits, and least number in which two tags differ."""

@@ -9,6 +9,7 @@ against anything else, is `sonar_graph.sonar.evidence`. Derivation: docs/theory/
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -22,8 +23,9 @@ from sonar_graph.numerics import compiled
 from sonar_graph.sonar.confusion import Confusion
 from sonar_graph.sonar.evidence import Figures
 from sonar_graph.sonar.geometry import FloorView
+from sonar_graph.sonar.place import Relief
 from sonar_graph.sonar.regions import Candidates
-from sonar_graph.sonar.templates import Floats32, Patch, PolarGrid, Templates
+from sonar_graph.sonar.templates import BLUR_RATIO, Blur, Floats32, Patch, PolarGrid, Templates
 
 COARSE = 2
 """Cells between the places from which the search climbs to the best one."""
@@ -38,8 +40,6 @@ class AppearanceParams(Section):
     """Distance of the samples on the floor."""
     margin_m: float = Field(0.03, ge=0)
     """Width of the compared ring of floor around the largest design."""
-    blur_m: float = Field(0.01, gt=0)
-    """Standard deviation of the sonar's resolution on the floor."""
     search_m: float = Field(0.045, ge=0)
     """Largest distance of a landmark's centre from the candidate's centroid, along each axis."""
     least_visible: float = Field(0.65, gt=0, le=1)
@@ -59,7 +59,9 @@ class DesignFit:
     heading_rad: Floats
     """Heading of each design's x axis against the floor's, shape (designs,)."""
     centre_m: Floats
-    """(x, y) of each design's centre on the floor, between the grid's points, shape (designs, 2)."""
+    """(x, y) of each design's centre on the floor where it correlates best, shape (designs, 2)."""
+    template: Ints
+    """Row of each design's template in `Templates`, shape (designs,)."""
 
 
 class Search(NamedTuple):
@@ -80,17 +82,19 @@ class Search(NamedTuple):
 
 
 class Appearance:
-    """Comparison of patches with the templates of designs."""
+    """Comparison of patches with the templates of designs, as a sonar of one resolution sees them."""
 
-    def __init__(self, designs: Sequence[LandmarkDesign], params: AppearanceParams | None = None) -> None:
+    def __init__(self, designs: Sequence[LandmarkDesign], blur_m: Blur, params: AppearanceParams | None = None) -> None:
         self.params = params or AppearanceParams()
-        self.templates = templates = Templates.of(designs, self.params.cell_m, self.params.margin_m, self.params.blur_m)
+        self.templates = templates = Templates.of(designs, self.params.cell_m, self.params.margin_m, blur_m)
         self.designs = len(designs)
         self._steps = math.ceil(self.params.search_m / self.params.cell_m)
-        self.figures = Figures.of(designs, templates, self.params.blur_m, 2 * self._steps)
+        self.figures = Figures.of(designs, templates, blur_m, 2 * self._steps)
         self.patch_side = self.figures.patch_side
         self._rim = (self.patch_side - templates.side) // 2 - self._steps
-        x, y = np.divmod(templates.cells, templates.side)
+        self._designs, self._blur_m = tuple(designs), blur_m
+        self._compared = x, y = np.divmod(templates.cells, templates.side)
+        self._reliefs: dict[int, Relief] = {}
         pictures = templates.pictures
         self._search = Search(
             (x + self._rim) * self.patch_side + y + self._rim,
@@ -113,7 +117,26 @@ class Appearance:
         if visible < params.least_visible or (evidence := self.figures.evidence(patch, template, cell)) is None:
             return None
         centre_m = patch.centre_m + params.cell_m * (top - self._steps)
-        return DesignFit(evidence, visible, self.templates.heading_rad[template], centre_m)
+        return DesignFit(evidence, visible, self.templates.heading_rad[template], centre_m, template)
+
+    def place(self, patch: Patch, fit: DesignFit, design: int, grazing_slope: float) -> tuple[Floats, Floats]:
+        """Place of a design in a patch that it fits, and the bound of its standard deviations (x, y on the floor, m).
+
+        ``grazing_slope`` is the height of the sonar over the distance along the floor.
+        """
+        cell_m, row = self.params.cell_m, int(fit.template[design])
+        if row not in self._reliefs:
+            heading_rad = float(self.templates.heading_rad[row])
+            self._reliefs[row] = Relief.of(
+                self._designs[design], heading_rad, self.templates.side, cell_m, self._blur_m
+            )
+        relief_m, origin = self._designs[design].standing_m, self._rim + self._steps
+        start = (fit.centre_m[design] - patch.centre_m) / cell_m + origin
+        side_m, shadow_m = relief_m * grazing_slope, relief_m * (grazing_slope + 1 / grazing_slope)
+        place, bound = self._reliefs[row].place(
+            patch.level_db, patch.seen, self._compared, start, side_m, shadow_m / cell_m
+        )
+        return patch.centre_m + cell_m * (place - origin), cell_m * bound
 
 
 def numbered_places(side: int) -> Ints:
@@ -239,6 +262,8 @@ CENTROID_SIGMA_M = 0.04
 """Standard deviation of a candidate's centroid from the landmark's centre, along and across; used without a fit."""
 SLANT_PLANE = FloorView(np.eye(3), 1e-3)
 """Plane of the image, which holds the patches where no floor is known."""
+ASSUMED_SLOPE = math.tan(math.radians(30.0))
+"""Of the ray to such a patch against the floor that is not known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,15 +278,42 @@ class ObjectSighting:
     """Of range and azimuth, shape (2, 2)."""
     range_per_height: float = 0.0
     """Metres of range by which the landmark's face seems nearer for each metre that it is higher; 0: not known."""
-    bin_m: float = math.nan
-    """Length of the frame's range bins."""
+    bound_m: Floats | None = None
+    """Cramer-Rao bound of the standard deviations of the best design along the ray and across it, range times azimuth,
+    shape (2,); None without a fit."""
+
+
+class Fitted(NamedTuple):
+    """Fit of all designs to a patch, and the place of the best one on the floor."""
+
+    of_designs: DesignFit
+    centre_m: Floats
+    """(x, y), x away from the sonar through the middle of the patch, shape (2,)."""
+    bound_m: Floats
+    """Cramer-Rao bound of its standard deviations, shape (2,)."""
+
+
+@lru_cache(maxsize=64)
+def appearance_at(designs: tuple[LandmarkDesign, ...], params: AppearanceParams, away: int, across: int) -> Appearance:
+    """Appearance of designs to a sonar that blurs by so many steps of `BLUR_RATIO` from a millimetre on."""
+    return Appearance(designs, (1e-3 * BLUR_RATIO**away, 1e-3 * BLUR_RATIO**across), params)
+
+
+MOST_PREPARED = 12
+"""Sets of templates that are drawn in advance, half a second of work each: enough for a view from 1 m to 4 m."""
 
 
 class CandidateFit:
     """Comparison of candidates with designs, for a sonar of this full vertical opening."""
 
-    def __init__(self, appearance: Appearance, confusion: Confusion, elevation_aperture_rad: float) -> None:
-        self._appearance, self._confusion = appearance, confusion
+    def __init__(
+        self,
+        designs: Sequence[LandmarkDesign],
+        params: AppearanceParams,
+        confusion: Confusion,
+        elevation_aperture_rad: float,
+    ) -> None:
+        self._designs, self._params, self._confusion = tuple(designs), params, confusion
         self._aperture_rad = elevation_aperture_rad
         self._grid: PolarGrid | None = None
         self._shape: tuple[Floats, Floats] = np.empty(0), np.empty(0)
@@ -282,43 +334,62 @@ class CandidateFit:
         sightings = iter(self._sightings(view, range_m, azimuth_rad, bearing_rad, fits))
         return [None if row < 0 else next(sightings) for row in rows.tolist()]
 
-    def _fit(self, image_db: Floats32, plane: FloorView, away_m: float, bearing_rad: float) -> DesignFit | None:
+    def _fit(self, image_db: Floats32, plane: FloorView, away_m: float, bearing_rad: float) -> Fitted | None:
         """Fit of the designs to what lies at a distance and bearing on the floor; NaN: the ray does not reach it."""
         assert self._grid is not None
         if math.isnan(away_m):
             return None
-        side, cell_m = self._appearance.patch_side, self._appearance.params.cell_m
+        steps = self._grid.blur_steps(away_m, math.hypot(away_m, plane.height_m))
+        appearance = appearance_at(self._designs, self._params, *steps)
         ahead, centre_m = plane.turned(bearing_rad), np.array([away_m, 0.0])
-        return self._appearance.fit(self._grid.patch(image_db, ahead, centre_m, side, cell_m))
+        patch = self._grid.patch(image_db, ahead, centre_m, appearance.patch_side, self._params.cell_m)
+        if (fit := appearance.fit(patch)) is None:
+            return None
+        best = int(np.argmax(self._confusion.log_odds(fit.evidence)))
+        slope = ASSUMED_SLOPE if plane is SLANT_PLANE else plane.height_m / away_m
+        return Fitted(fit, *appearance.place(patch, fit, best, slope))
+
+    def prepare(self, ranges_m: Floats, azimuths_rad: Floats, depressions_rad: tuple[float, float]) -> None:
+        """Draw templates before the first candidate needs them, at most `MOST_PREPARED` sets, middle ranges first.
+
+        Candidates are seen from so far to so far below the horizon.
+        """
+        grid = PolarGrid.of(ranges_m, azimuths_rad, self._aperture_rad)
+        for steps in grid.steps_in_view(float(ranges_m[0]), float(ranges_m[-1]), depressions_rad)[:MOST_PREPARED]:
+            appearance_at(self._designs, self._params, *steps)
 
     def _sightings(
         self, view: FloorView | None, range_m: Floats, azimuth_rad: Floats, bearing_rad: Floats,
-        fits: list[DesignFit | None],
+        fits: list[Fitted | None],
     ) -> list[ObjectSighting]:  # fmt: skip
         """Sightings where the centre of the best design is; without a fit where the candidate's centroid is."""
-        assert self._grid is not None
-        model, bin_m, fitted = self._confusion, self._grid.bin_m, [fit for fit in fits if fit is not None]
+        model, fitted = self._confusion, [fit for fit in fits if fit is not None]
         covariance, rise = np.zeros((len(fits), 2, 2)), np.zeros(len(fits))
         covariance[:, 0, 0], covariance[:, 1, 1] = CENTROID_SIGMA_M**2, (CENTROID_SIGMA_M / range_m) ** 2
+        bounds: list[Floats | None] = [None] * len(fits)
         if fitted:
             rows = np.flatnonzero([fit is not None for fit in fits])
-            best = np.argmax(model.log_odds(np.array([fit.evidence for fit in fitted])), axis=1)
-            x, y = np.array([fit.centre_m[k] for fit, k in zip(fitted, best.tolist(), strict=True)]).T
+            x, y = np.array([fit.centre_m for fit in fitted]).T
             cos, sin = np.cos(bearing_rad[rows]), np.sin(bearing_rad[rows])
             level_xy = np.array([cos * x - sin * y, sin * x + cos * y]).T
             r, azimuth_rad[rows] = (view or SLANT_PLANE).range_azimuth(level_xy)
             rise[rows] = 0.0 if view is None else view.height_m / r
             range_m[rows] = r + model.height_bias_m * rise[rows]
-            covariance[rows] = model.range_azimuth_cov(np.array([fit.visible for fit in fitted]), bin_m)
-        columns = fits, range_m.tolist(), azimuth_rad.tolist(), covariance, rise.tolist()
-        return [ObjectSighting(*row, bin_m) for row in zip(*columns, strict=True)]
+            away_m = np.hypot(x, y)
+            bound = np.array([fit.bound_m for fit in fitted]) * np.array([away_m / r, r / away_m]).T
+            covariance[rows] = np.minimum(model.range_azimuth_cov(bound, r), covariance[rows])
+            for row, one in zip(rows.tolist(), bound, strict=True):
+                bounds[row] = one
+        of = [None if fit is None else fit.of_designs for fit in fits]
+        columns = of, range_m.tolist(), azimuth_rad.tolist(), covariance, rise.tolist(), bounds
+        return [ObjectSighting(*row) for row in zip(*columns, strict=True)]
 
     def log_odds(self, sightings: Sequence[ObjectSighting | None]) -> Floats:
         """Log odds of each design against none of them, last 0 for these, shape (M, designs + 1).
 
         Of a track that ends looking like this; rows of NaN where nothing was compared.
         """
-        odds = np.full((len(sightings), self._appearance.designs + 1), np.nan)
+        odds = np.full((len(sightings), len(self._designs) + 1), np.nan)
         fits = {row: one.fit for row, one in enumerate(sightings) if one is not None and one.fit is not None}
         if fits:
             odds[[*fits], :-1] = self._confusion.log_odds(np.array([fit.evidence for fit in fits.values()]))

@@ -28,7 +28,7 @@ from pydantic import Field
 from sonar_graph.calibration import Section
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.sonar.confusion import Confusion, soft_scores
-from sonar_graph.sonar.track_filter import Association
+from sonar_graph.sonar.tracker import Association
 
 Bools = NDArray[np.bool_]
 Rule = Literal["virtual-evidence", "jeffrey"]

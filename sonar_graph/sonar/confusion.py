@@ -17,7 +17,6 @@ The model that ships, ``default_confusion.json``, was measured on simulated basi
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -59,7 +58,15 @@ class DesignMark(Section):
 
 
 class Confusion(Section):
-    """The measured model of a recogniser."""
+    """The measured model of a recogniser.
+
+    Examples
+    --------
+    >>> from sonar_graph.sonar import SHIPPED, read_confusion
+    >>> model = read_confusion(SHIPPED)
+    >>> model.ids, len(model.matrix)
+    ((1, 2, 3, 4), 5)
+    """
 
     ids: tuple[int, ...] = Field(min_length=1)
     """Identities of the designs, in the order of rows and columns."""
@@ -76,15 +83,19 @@ class Confusion(Section):
     doubt: float = Field(5e-4, ge=0, lt=1)
     """Share of tracks whose looks tell nothing: what was never seen in n tracks may still happen in 1 / 2n of them."""
     range_sigma_m: float = Field(gt=0, allow_inf_nan=False)
-    """Standard deviation of the range in a frame that shows the whole landmark."""
-    azimuth_sigma_rad: float = Field(gt=0, allow_inf_nan=False)
-    """The same of the azimuth."""
-    bin_m: float | None = Field(None, gt=0, allow_inf_nan=False)
-    """Length of the range bins of the frames in which these were measured; None: they hold for bins of any length."""
+    """Standard deviation of the range in a frame whose bound of it is `range_bound_m`."""
+    across_sigma_m: float = Field(gt=0, allow_inf_nan=False)
+    """The same across, range times azimuth, where its bound is `across_bound_m`."""
+    range_bound_m: float = Field(gt=0, allow_inf_nan=False)
+    """Usual Cramer-Rao bound of the range (`ObjectSighting.bound_m`)."""
+    across_bound_m: float = Field(gt=0, allow_inf_nan=False)
+    """The same across."""
+    bound_power: float = Field(gt=0, le=4)
+    """Power of the bound with which standard deviations grow: 1 where a fit errs by nothing but white noise."""
     height_bias_m: float = Field(0.0, gt=-1, lt=1)
     """Height of the faces that sound sees over the heights of the true landmarks."""
-    error_correlation: float = Field(0.0, ge=0, lt=1)
-    """Correlation of the errors of range and azimuth in successive frames of a track."""
+    report_interval_s: float = Field(0.0, ge=0, allow_inf_nan=False)
+    """Time in which a track tells as much of a place as one independent frame; 0: its frames are independent."""
     provenance: Mapping[str, str] = Field(default_factory=dict)
     """Source of the frames, counts by class, assumptions."""
 
@@ -125,7 +136,7 @@ class Confusion(Section):
             if mark != mark_of(design):
                 raise CalibrationError(
                     f"{source}: measured for another landmark {design.id} ({mark.name}) than the design given "
-                    f"({design.name}): name, size, height or picture differ; {remedy}"
+                    f"({design.name}): name, size, height, relief or picture differ; {remedy}"
                 )
 
     def array(self) -> Floats:
@@ -136,23 +147,19 @@ class Confusion(Section):
         """Log odds of each design against none of them, shape (..., designs), from evidence (..., designs, 9)."""
         return np.asarray(evidence @ np.array(self.weights))
 
-    def range_azimuth_cov(self, visible: Floats, bin_m: float) -> Floats:
-        """Covariances of range and azimuth of landmarks with these shares in view, shape (n, 2, 2), in bins so long.
+    def range_azimuth_cov(self, bound_m: Floats, range_m: Floats) -> Floats:
+        """Covariances of range and azimuth, shape (n, 2, 2), for `ObjectSighting.bound_m` (n, 2) at ranges (n,).
 
-        Sigmas grow with the inverse square of the share, as measured on simulated basins. Variances grow with the bins:
-        a bin is one look at the speckle, so that a landmark has half as many where bins are twice as long.
+        ``sigma = usual sigma (bound / usual bound)^power``: a fit with less contrast, with less of the landmark in view
+        or with a larger residual has a larger bound, and errs more than by white noise. What a template lacks is some
+        millimetres of the landmark wherever it lies, so that the law is in metres across, not in angles.
         """
-        longer = 1.0 if self.bin_m is None else max(bin_m / self.bin_m, 1.0)
-        variances = np.diag([self.range_sigma_m**2, self.azimuth_sigma_rad**2])
-        return np.asarray(variances * longer / visible[:, None, None] ** 4)
-
-    def report_interval(self) -> int:
-        """Number of frames of a track that tell as much of a place as one independent frame.
-
-        n frames whose errors have the correlation rho from one to the next (a first-order autoregression) tell as much
-        as ``1 + (n - 1) (1 - rho) / (1 + rho)`` independent ones: one more in every ``(1 + rho) / (1 - rho)`` frames.
-        """
-        return math.ceil((1 + self.error_correlation) / (1 - self.error_correlation) - 1e-9)
+        usual = np.array([self.range_bound_m, self.across_bound_m])
+        sigmas = np.array([self.range_sigma_m, self.across_sigma_m]) * (bound_m / usual) ** self.bound_power
+        sigmas[:, 1] /= range_m
+        covariances = np.zeros((len(bound_m), 2, 2))
+        covariances[:, [0, 1], [0, 1]] = sigmas**2
+        return covariances
 
 
 def posterior_mean_rows(mean_scores: Floats, trials: Ints) -> Floats:
@@ -177,13 +184,19 @@ def read_confusion(path: Path) -> Confusion:
     ------
     CalibrationError
         When the file is not JSON or not such a model, naming the field.
+
+    Examples
+    --------
+    >>> from sonar_graph.sonar import SHIPPED, read_confusion
+    >>> read_confusion(SHIPPED).looks > 0
+    True
     """
     try:
         values = json.loads(text_of(path))
-        if isinstance(values, dict) and "sharpness" in values:
+        if isinstance(values, dict) and values.keys() & {"sharpness", "error_correlation", "azimuth_sigma_rad"}:
             raise CalibrationError(
-                f"{path}: weights: missing; it has sharpness and threshold, which belong to an earlier version that "
-                "compared by correlation; measure it again with sonar-graph calibrate"
+                f"{path}: across_bound_m: missing; it is a model of an earlier version without the bounds of the fit's "
+                "accuracy across; measure it again with sonar-graph calibrate"
             )
         return Confusion.model_validate(values)
     except OSError as error:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from sonar_graph.devices import LandmarkDesign
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.numerics import compiled
-from sonar_graph.sonar.templates import Floats32, Patch, Templates, drawn, material_radius_m
+from sonar_graph.sonar.templates import Blur, Floats32, Patch, Templates, drawn, material_radius_m
 
 Bools = NDArray[np.bool_]
 EVIDENCE = ("prior", "outline", "figure", "contrast", "beyond", "floor", "behind", "plate", "bare")
@@ -80,7 +80,7 @@ class Figures(NamedTuple):
     """Whether it has dark parts, shape (templates,)."""
 
     @classmethod
-    def of(cls, designs: Sequence[LandmarkDesign], templates: Templates, blur_m: float, last: int) -> Figures:
+    def of(cls, designs: Sequence[LandmarkDesign], templates: Templates, blur_m: Blur, last: int) -> Figures:
         """Models of designs at the headings of their templates, for places 0 to ``last`` along each axis."""
         cell_m, material_m = templates.cell_m, max(map(material_radius_m, designs))
         half = math.ceil((material_m + SHADOW_M) / cell_m)

@@ -36,6 +36,16 @@ class FloorView:
     ------
     CalibrationError
         When the sonar is not above the floor, or the centre beam is vertical.
+
+    Examples
+    --------
+    A metre above the floor, looking down by 30°: the centre beam meets the floor at 2 m.
+
+    >>> import numpy as np
+    >>> from sonar_graph.sonar import FloorView
+    >>> view = FloorView.from_angles(1.0, 0.0, np.radians(30.0))
+    >>> view.floor_point(2.0, 0.0).round(3)
+    array([1.732, 0.   ])
     """
 
     level_R_sonar: Floats
@@ -107,7 +117,16 @@ class FloorView:
 
 @dataclass(frozen=True, eq=False)
 class Fan:
-    """Nearest beam and bin of each pixel of a picture, range up, azimuth to the left; for display only."""
+    """Nearest beam and bin of each pixel of a picture, range up, azimuth to the left; for display only.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sonar_graph.sonar import Fan
+    >>> fan = Fan.of(np.linspace(1.0, 3.0, 100), np.linspace(0.25, -0.25, 48))
+    >>> fan.beam.shape == fan.bin.shape
+    True
+    """
 
     beam: NDArray[np.int32]
     """Shape (height, width); -1 outside of the fan."""
@@ -149,6 +168,18 @@ def with_lens(frames: SonarFrames, lens: str) -> SonarFrames:
     ------
     CalibrationError
         When no table is known for so many beams.
+
+    Examples
+    --------
+    A driver that spaced the beams of a DIDSON equally:
+
+    >>> import numpy as np
+    >>> from sonar_graph import SonarFrames
+    >>> from sonar_graph.sonar import with_lens
+    >>> even = np.radians(np.linspace(14.25, -14.25, 96))
+    >>> frames = SonarFrames(np.array([0]), np.zeros((1, 96, 512), np.uint8), np.linspace(1.0, 3.0, 512), even)
+    >>> np.degrees(with_lens(frames, "didson").azimuths_rad[:2]).round(2)
+    array([14.25, 14.04])
     """
     if lens == "as-logged":
         return frames

@@ -6,6 +6,7 @@ The steps are those of the 2014 paper: candidate selection, elimination of noisy
 Every candidate, track and unused frame has a row in `Recogniser.fates` that says why.
 """
 
+from bisect import bisect_right
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -18,19 +19,27 @@ from sonar_graph.calibration import Calibration, Section
 from sonar_graph.devices import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.images import SonarFrames, decibels
 from sonar_graph.measurements import Floats, Ints, LandmarkDetections
-from sonar_graph.sonar.appearance import Appearance, AppearanceParams, CandidateFit, ObjectSighting
+from sonar_graph.sonar.appearance import AppearanceParams, CandidateFit, ObjectSighting
 from sonar_graph.sonar.bayes import Beliefs, IdentityParams
 from sonar_graph.sonar.cfar import DetectionParams, check_candidates, select_candidates
 from sonar_graph.sonar.confusion import Confusion, confusion_for
 from sonar_graph.sonar.frame_check import FrameCheck, check_block
 from sonar_graph.sonar.geometry import FloorView
 from sonar_graph.sonar.regions import Candidates, CandidateVerdict
-from sonar_graph.sonar.track_filter import Association, SonarStep
-from sonar_graph.sonar.tracker import Tracker, TrackingParams
+from sonar_graph.sonar.tracker import Association, SonarStep, Tracker, TrackingParams
 
 
 class RecogniserParams(Section):
-    """Settings of the recogniser."""
+    """Settings of the recogniser.
+
+    Examples
+    --------
+    >>> from sonar_graph import Calibration
+    >>> from sonar_graph.sonar import Recogniser, RecogniserParams
+    >>> recogniser = Recogniser(Calibration(), params=RecogniserParams(detection={"false_alarm": 1e-4}))
+    >>> recogniser.params.detection.false_alarm
+    0.0001
+    """
 
     detection: DetectionParams = DetectionParams()
     tracking: TrackingParams = TrackingParams()
@@ -43,12 +52,25 @@ class RecogniserParams(Section):
     least_frames: int = Field(3, ge=1)
     """Frames in which a track must have been seen before it is reported."""
     independent: bool = True
-    """Report a track as often as its errors are independent, and when its most probable identity changes. False: in
-    every frame, as if errors of successive frames were independent."""
+    """Report a track as often as its errors are independent, and when its most probable identity changes or reaches one
+    of `ACCEPTED_FROM`. False: in every frame, as if errors of successive frames were independent."""
 
 
 class Fate(NamedTuple):
-    """Outcome of one candidate, one track, or a whole frame."""
+    """Outcome of one candidate, one track, or a whole frame.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sonar_graph import Calibration, SonarFrames
+    >>> from sonar_graph.sonar import Recogniser
+    >>> recogniser = Recogniser(Calibration())
+    >>> black = np.zeros((1, 96, 512), np.uint8)
+    >>> ranges_m, azimuths_rad = np.linspace(1.26, 2.51, 512), np.linspace(0.25, -0.25, 96)
+    >>> found = recogniser.process(SonarFrames(np.array([0]), black, ranges_m, azimuths_rad))
+    >>> [fate.outcome for fate in recogniser.fates]
+    ['frame not used: all samples are zero']
+    """
 
     stamp_ns: int
     track: int
@@ -60,6 +82,10 @@ class Fate(NamedTuple):
     """Words; `REPORTED` for a detection."""
 
 
+PITCH_RAD, STEEPEST_RAD = 0.15, 1.3
+"""Tilt of a vehicle, and steepest view, for which templates are drawn in advance."""
+ACCEPTED_FROM = (0.5, 0.7)
+"""Posteriors from which an identity is likelier than not, and from which estimators accept it by default."""
 REPORTED = "reported"
 NOT_INDEPENDENT = "not reported: too soon after the track's last detection to be independent of it"
 REJECTED = {int(v): f"candidate rejected: {v.name.lower().replace('_', ' ')}" for v in CandidateVerdict}
@@ -109,15 +135,16 @@ class Recogniser:
         self.confusion.check_designs(self.designs)
         check_candidates(self.designs, self.params.detection, self.params.appearance.search_m)
         self._calibration = calibration
-        self._look = CandidateFit(
-            Appearance(self.designs, self.params.appearance), self.confusion, calibration.sonar.elevation_aperture_rad
-        )
+        opening_rad = calibration.sonar.elevation_aperture_rad
+        self._look = CandidateFit(self.designs, self.params.appearance, self.confusion, opening_rad)
         self._tracker = Tracker(self.params.tracking)
         self._beliefs = Beliefs(self.confusion, self.params.identity)
         self._check = FrameCheck(calibration.sonar.image)
         self._start_T_sonar = gtsam.Pose3()
-        self._interval = self.confusion.report_interval() if self.params.independent else 1
-        self._reported: dict[int, tuple[int, int]] = {}
+        self._interval_ns = round(1e9 * self.confusion.report_interval_s) if self.params.independent else 0
+        self._reported: dict[int, tuple[int, tuple[int, int]]] = {}
+        """Stamp of the last report of each track, its most probable identity then, and how many of `ACCEPTED_FROM` that
+        had reached."""
         self.fates: list[Fate] = []
         """Outcome of every candidate, track and fault in the last frame."""
         self.stamp_ns: int | None = None
@@ -130,6 +157,13 @@ class Recogniser:
         """Independent share of the last frame for these tracks."""
         self.beliefs: Floats = np.empty((0, len(self.ids) + 1))
         """Probability of each landmark and of none of them for these tracks, shape (M, ids + 1)."""
+
+    def prepare(self, frame: SonarFrames) -> None:
+        """Draw the templates that frames with these ranges and beams may need, while nobody waits."""
+        sonar = self._calibration.sonar
+        tilt_rad, half_rad = abs(sonar.mounting.rpy_rad[1]), sonar.elevation_aperture_rad / 2 + PITCH_RAD
+        depressions_rad = max(tilt_rad - half_rad, 0.0), min(tilt_rad + half_rad, STEEPEST_RAD)
+        self._look.prepare(frame.ranges_m, frame.azimuths_rad, depressions_rad)
 
     def process(
         self, frame: SonarFrames, motion: SonarStep | None = None, view: FloorView | None = None
@@ -201,19 +235,20 @@ class Recogniser:
             if sighting is None:
                 continue
             outcome, track = REPORTED, int(association.ids[row])
-            seen, best = int(association.frames_seen[row]), int(np.argmax(beliefs[row]))
-            last_seen, last_best = before.get(track, (-self._interval, best))
+            best = int(np.argmax(beliefs[row]))
+            said = best, bisect_right(ACCEPTED_FROM, beliefs[row, best]) if best < len(self.ids) else 0
+            last_ns, last_said = before.get(track, (stamp_ns - self._interval_ns, said))
             if sighting.fit is None:
                 outcome = "not reported: too little of it is in view"
             elif association.frames_seen[row] < params.least_frames:
                 outcome = f"not reported: seen in fewer than {params.least_frames} frames"
             elif association.existence[row] < params.least_existence:
                 outcome = f"not reported: exists with less than {params.least_existence:g}"
-            elif seen - last_seen < self._interval and best == last_best:
+            elif stamp_ns - last_ns < self._interval_ns and said[0] == last_said[0] and said[1] <= last_said[1]:
                 outcome = NOT_INDEPENDENT
             else:
                 reported.append((row, sighting))
-                self._reported[track] = seen, best
+                self._reported[track] = stamp_ns, said
             self.fates.append(Fate(stamp_ns, track, sighting.range_m, sighting.azimuth_rad, outcome))
         self.fates += [
             Fate(stamp_ns, track, np.nan, np.nan, f"track ended: {reason}")

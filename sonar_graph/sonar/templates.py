@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import cv2
@@ -21,9 +22,18 @@ from sonar_graph.numerics import compiled, inlined
 from sonar_graph.sonar.geometry import FloorView
 
 Floats32 = NDArray[np.float32]
+Blur = tuple[float, float]
+"""Standard deviations of the sonar's resolution on the floor, away from it and across, m."""
+BLUR_RATIO = math.sqrt(2)
+"""Of one blur to the next for which there are templates."""
+NEAREST = 30
+"""Last range of a sonar over the nearest one at which candidates are expected."""
 HEADINGS = 48
 FINE = 4
 """Points of a cell, along each axis, over which a mask is averaged."""
+LEAST_BLUR_M = 1e-3
+MOST_POWERS = 1024
+"""Number of drawings before the blur that are kept, some 80 kB each: those of four designs are 561."""
 SEARCHED_DARK = 0.5
 """Share of the dark parts' level in the templates of the search: a plate may be as its design or not be seen."""
 SAME_SHARE = 0.05
@@ -48,8 +58,8 @@ class Templates:
     """Of the design's x axis against the grid's, shape (templates,)."""
 
     @classmethod
-    def of(cls, designs: Sequence[LandmarkDesign], cell_m: float, margin_m: float, blur_m: float) -> Templates:
-        """Templates of all designs at all headings, blurred by the resolution of the sonar.
+    def of(cls, designs: Sequence[LandmarkDesign], cell_m: float, margin_m: float, blur_m: Blur) -> Templates:
+        """Templates of all designs at all headings, blurred by the resolution of the sonar (`drawn`).
 
         Around the largest design lies a ring of floor, without the part behind it, which the design may shade: the x
         axis of the grid points away from the sonar.
@@ -83,23 +93,54 @@ class Templates:
 
 
 def drawn(
-    design: LandmarkDesign, heading_rad: float, side: int, cell_m: float, blur_m: float,
+    design: LandmarkDesign, heading_rad: float, side: int, cell_m: float, blur_m: Blur,
     stretch: tuple[float, float] = (1.0, 1.0),
 ) -> tuple[Floats32, Floats32]:  # fmt: skip
     """Bright and dark parts of a design over the floor, dB, as the sonar sees them, shapes (side, side).
 
-    Stretched along its axes x and y, and blurred by the resolution of the sonar.
+    Stretched along its axes x and y. The beams and the pulse blur the *power* of the echo, so that what is bright grows
+    and what is dark shrinks; a cell is then a mean of decibels. Both parts add up to the whole.
     """
+    bright_db, whole_db = (
+        seen_db(power, cell_m, blur_m) for power in echo_power(design, heading_rad, side, cell_m, stretch)
+    )
+    return bright_db, whole_db - bright_db
+
+
+@lru_cache(maxsize=MOST_POWERS)
+def echo_power(
+    design: LandmarkDesign, heading_rad: float, side: int, cell_m: float, stretch: tuple[float, float] = (1.0, 1.0)
+) -> tuple[Floats32, Floats32]:
+    """Power of the echo of a design's bright parts and of all of it, not blurred, over `FINE` points a cell."""
     fine_m = cell_m / FINE * (np.arange(side * FINE) - side * FINE / 2 + 0.5)
     x_m, y_m = np.meshgrid(fine_m, fine_m, indexing="ij")
     cos, sin = math.cos(heading_rad), math.sin(heading_rad)
     level = design.level_db((cos * x_m + sin * y_m) / stretch[0], (-sin * x_m + cos * y_m) / stretch[1])
     level = np.nan_to_num(level).astype(np.float32)
-    bright, dark = (
-        cv2.GaussianBlur(part, (0, 0), blur_m / cell_m * FINE).reshape(side, FINE, side, FINE).mean(axis=(1, 3))
-        for part in (np.maximum(level, 0), np.minimum(level, 0))
-    )
-    return bright, dark
+    bright, whole = (np.asarray(10 ** (one / 10), np.float32) for one in (np.maximum(level, 0), level))
+    return bright, whole
+
+
+def seen_db(power: Floats32, cell_m: float, blur_m: Blur) -> Floats32:
+    """Levels of cells, as the sonar sees the power of fine ones."""
+    return of_cells(np.asarray(10 * np.log10(blurred(power, cell_m, blur_m)), np.float32))
+
+
+def seen_share(is_in: NDArray[np.bool_], cell_m: float, blur_m: Blur) -> Floats32:
+    """Shares of the echo of cells that come from fine ones."""
+    return of_cells(blurred(is_in.astype(np.float32), cell_m, blur_m))
+
+
+def blurred(fine: Floats32, cell_m: float, blur_m: Blur) -> Floats32:
+    """Power on a fine grid, blurred away from the sonar (x) and across."""
+    away, across = (max(one, LEAST_BLUR_M) / cell_m * FINE for one in blur_m)
+    return np.asarray(cv2.GaussianBlur(fine, (0, 0), sigmaX=across, sigmaY=away), np.float32)
+
+
+def of_cells(fine: Floats32) -> Floats32:
+    """Means of the fine points of each cell."""
+    side = len(fine) // FINE
+    return np.asarray(fine.reshape(side, FINE, side, FINE).mean(axis=(1, 3)), np.float32)
 
 
 def material_radius_m(design: LandmarkDesign) -> float:
@@ -136,6 +177,10 @@ class Patch(NamedTuple):
         return cls(level_db, seen, smooth, held, centre_m)
 
 
+WIDTH_TO_SIGMA = 1 / 2.355
+"""Standard deviation of a normal curve over its width at half of its height."""
+
+
 class PolarGrid(NamedTuple):
     """Beams and bins of an image, for looking up ranges and azimuths."""
 
@@ -145,6 +190,8 @@ class PolarGrid(NamedTuple):
     azimuth_step_rad: float
     beam_of_azimuth: Floats
     """Number of the beam, with fractions, at equally spaced azimuths."""
+    spacing_rad: float
+    """Mean angle between beams."""
     highest_sine: float
     """Sine of the elevation at the rim of the opening; what lies above is not in the image, whatever the range."""
 
@@ -159,8 +206,35 @@ class PolarGrid(NamedTuple):
             float(places[0]),
             float(places[1] - places[0]),
             np.interp(places, azimuths_rad[order], order.astype(float)),
+            float(np.ptp(azimuths_rad)) / (len(azimuths_rad) - 1),
             math.sin(min(elevation_aperture_rad, math.pi) / 2),
         )
+
+    def blur_m(self, away_m: float, range_m: float) -> Blur:
+        """Resolution on the floor at a distance along it and a range.
+
+        Sonars sample their images as finely as they resolve: a beam, both ways, is at half of its power as wide as
+        beams are apart, and the pulse as long as a bin.
+        """
+        return WIDTH_TO_SIGMA * self.bin_m * range_m / away_m, WIDTH_TO_SIGMA * self.spacing_rad * range_m
+
+    def blur_steps(self, away_m: float, range_m: float) -> tuple[int, int]:
+        """Nearest steps of `BLUR_RATIO`, from a millimetre on, to the resolution on the floor."""
+        away, across = (max(0, round(math.log(one / 1e-3, BLUR_RATIO))) for one in self.blur_m(away_m, range_m))
+        return away, across
+
+    def steps_in_view(
+        self, first_m: float, last_m: float, depressions_rad: tuple[float, float]
+    ) -> list[tuple[int, int]]:
+        """All `blur_steps` between two ranges and depressions, those of middle ranges first."""
+        first_m = max(first_m, last_m / NEAREST)
+        shares = np.linspace(-0.5, 0.5, math.ceil(4 * math.log(last_m / first_m, BLUR_RATIO)) + 2)
+        found = dict[tuple[int, int], None]()
+        for share in sorted(shares.tolist(), key=abs):
+            range_m = math.sqrt(first_m * last_m) * (last_m / first_m) ** share
+            for depression_rad in np.linspace(*depressions_rad, 5).tolist():
+                found[self.blur_steps(range_m * math.cos(depression_rad), range_m)] = None
+        return list(found)
 
     def patch(self, image_db: Floats32, view: FloorView, centre_m: Floats, side: int, cell_m: float) -> Patch:
         """The image on a grid of ``side`` by ``side`` floor points around a centre."""

@@ -34,6 +34,13 @@ def small_world(dvl_delay_s: float = 0.0) -> Sequence:
     ----------
     dvl_delay_s
         Time by which the DVL begins after the IMU.
+
+    Examples
+    --------
+    >>> from sonar_graph.testing import small_world
+    >>> world = small_world()
+    >>> world.duration_s, len(world.imu), len(world.dvl), world.true_landmarks.ids
+    (20.0, 1001, 101, array([ 4,  9, 11]))
     """
     noise = np.random.default_rng(SEED)
     x, y, z = _circle(np.array([START_NS + round(dvl_delay_s * NS_PER_S)], dtype=np.int64)).positions[0].tolist()
@@ -58,7 +65,15 @@ def small_world(dvl_delay_s: float = 0.0) -> Sequence:
 
 
 def aided_world() -> Sequence:
-    """Left turn with heading and position fixes as well, of which every second row states its noise."""
+    """Left turn with heading and position fixes as well, of which every second row states its noise.
+
+    Examples
+    --------
+    >>> from sonar_graph.testing import aided_world
+    >>> world = aided_world()
+    >>> len(world.heading), len(world.positions)
+    (101, 21)
+    """
     world, noise = small_world(), np.random.default_rng(SEED)
     calibration = world.calibration.model_copy(
         update={"positions": PositionCalibration(sigma_m=(0.5, 0.5, 1.0), antenna_m=(-0.4, 0.2, 0.6))}
@@ -86,6 +101,13 @@ def misnamed_world(*, is_tracked: bool = False) -> Sequence:
     ----------
     is_tracked
         Landmarks are seen in tracks of `TRACK_FRAMES` frames, and an identity is wrong for a whole track.
+
+    Examples
+    --------
+    >>> from sonar_graph.testing import misnamed_world
+    >>> said, probability = misnamed_world().detections.most_probable()
+    >>> said[:2], int((said < 0).sum())
+    (array([ 9, 11]), 6)
     """
     world, noise = small_world(), np.random.default_rng(SEED)
     rows = world.detections
@@ -102,7 +124,15 @@ def misnamed_world(*, is_tracked: bool = False) -> Sequence:
 
 
 def still_world() -> Sequence:
-    """Tilted vehicle at rest for 60 s, without noise."""
+    """Tilted vehicle at rest for 60 s, without noise.
+
+    Examples
+    --------
+    >>> from sonar_graph.testing import still_world
+    >>> world = still_world()
+    >>> world.duration_s, world.detections is None
+    (60.00000000000001, True)
+    """
     calibration = Calibration(start=STILL_START)
     imu_stamps, slow_stamps = _stamps(0, IMU_HZ, STILL_S), _stamps(0, DVL_HZ, STILL_S)
     up_in_body = Rotation.from_euler("xyz", STILL_START.rpy_rad).inv().apply([0.0, 0.0, calibration.gravity_m_s2])

@@ -47,7 +47,21 @@ SYMMETRY = 1e-9
 
 
 class ContractError(AssertionError):
-    """An estimator breaks the contract; the message says how."""
+    """An estimator breaks the contract; the message says how.
+
+    Examples
+    --------
+    >>> from sonar_graph import load_estimator
+    >>> from sonar_graph.testing import ContractError, check_estimator
+    >>> class Forgetful(load_estimator("dead-reckoning")):
+    ...     def process(self, measurements):
+    ...         return None
+    >>> try:
+    ...     check_estimator(Forgetful)
+    ... except ContractError as error:
+    ...     print(error)
+    answers_from_the_first_imu_and_dvl_on: nothing is returned although there are IMU and DVL
+    """
 
 
 @dataclass(frozen=True, eq=False)

@@ -52,7 +52,8 @@ def do_here(runs: list[PlannedRun], store: Store, *_others: Any) -> None:
     for run in runs:
         with tempfile.TemporaryDirectory() as scratch:
             row = perform(run, Path(scratch))
-            store.write(run.key, RunOutcome(row))
+            files = {p.relative_to(scratch).as_posix(): p.read_bytes() for p in Path(scratch).glob("runs/*/*.[tc]*")}
+            store.write(run.key, RunOutcome(row, files=files))
 
 
 @pytest.fixture
@@ -69,6 +70,22 @@ def statuses_after(batch: Batch) -> Counter[str]:
     """Number of runs by status, after all of them were done."""
     batch.run(HERE, LIMITS, nobody)
     return Counter(str(row["status"]) for row in batch.rows().values())
+
+
+def test_a_run_alone_in_another_folder_gives_the_same_bytes(suite, tmp_path, monkeypatch):
+    monkeypatch.setattr(cluster, "run_batch", do_here)
+    whole = run_suite(suite, tmp_path / "whole")
+    key = whole.runs[2].key
+    again = run_suite(suite, tmp_path / "again", only=[key])
+    assert [(run.key, run.status) for run in again.runs] == [(key, "ok")]
+    assert [path.name for path in (tmp_path / "again" / "runs").iterdir()] == [key]
+    for name in ("causal.tum", "trajectory.tum", "landmarks.csv"):
+        file = Path("runs", key, "runs", "dead-reckoning", name)
+        assert (tmp_path / "again" / file).read_bytes() == (tmp_path / "whole" / file).read_bytes()
+    paths = [tmp_path / "whole" / "runs" / run.key / "runs" / "dead-reckoning" / "causal.tum" for run in whole.runs]
+    assert len({path.read_bytes() for path in paths}) == 4, "other seeds have other bytes"
+    with pytest.raises(BatchError, match="none of its 4 runs has the key 0123; keys stand in the"):
+        run_suite(suite, tmp_path / "again", only=["0123"])
 
 
 def test_what_a_large_log_takes_is_said_before_its_first_run(write_suite, in_this_process, monkeypatch, tmp_path):
@@ -208,7 +225,7 @@ def test_failed_runs_are_kept_until_they_are_discarded(suite, tmp_path, in_this_
         batch.store.write(batch.runs[0].key, RunOutcome({"status": "timeout", "reason": "took longer than 1 s"}))
         assert statuses_after(batch) == {"ok": 3, "timeout": 1}
         assert statuses_after(batch) == {"ok": 3, "timeout": 1}
-        batch.discard_failed()
+        batch.discard_failed(batch.runs)
         assert statuses_after(batch) == {"ok": 4}
 
 

@@ -263,3 +263,16 @@ def keys_by(code: Path, suite: Path) -> list[str]:
         f"print(*(run.key for run in plan.plan_runs(read_suite(Path({str(suite)!r})))))"
     )
     return subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True).stdout.split()
+
+
+ABSENT = '[[logs]]\nname = "x"\ndataset = "dlr"\noptions = { folder = "absent" }\n'
+
+
+def test_a_log_whose_files_are_absent_is_left_out_where_the_suite_says_how_to_obtain_it(write_suite):
+    obtain = 'obtain = "the data set from its authors"\n'
+    runs = planned(write_suite, HEADER, BASIN, ABSENT, obtain, DEAD_RECKONING)
+    assert [run.log for run in runs] == ["basin"]
+    with pytest.raises(BatchError, match="absent is not in"):
+        planned(write_suite, HEADER, BASIN, ABSENT, DEAD_RECKONING)
+    with pytest.raises(BatchError, match="no data of any log is here; get the data set from its authors"):
+        planned(write_suite, HEADER, ABSENT, obtain, DEAD_RECKONING)

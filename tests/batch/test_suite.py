@@ -95,7 +95,7 @@ def second(entry: str) -> str:
         (head('metrics = ["causal.ate_se3"]\n'), "metrics", "did you mean causal.ate_se3_m?"),
         (other('log = "no.mcap"\n'), "no.mcap", "no.mcap is not in"),
         (other('log = "suite.toml"\n'), "suite.toml", "not an MCAP file but a text"),
-        (other('log = "."\n'), "log =", "is a folder; give the .mcap file in it"),
+        (other('log = "."\n'), "log =", "is a folder without metadata.yaml"),
         (other('dataset = "mrclam"\n'), "[[logs]]", "robot: is missing"),
         (other(f"{PARK}landmarks = {{ seed = 1 }}\n"), "landmarks", "logs.0.landmarks.seed: cannot be set"),
         (HEADER + "[[logs]\n", "[[logs]", "not TOML"),

@@ -168,7 +168,7 @@ def test_start_and_end_cut_the_log(run, basin, tmp_path, capsys):
     notes = json.loads((tmp_path / "out" / "comparison.json").read_text())["sequence"]["notes"]
     assert notes["log.part"] == "30.000 s to 60.000 s of the recording"
     capsys.readouterr()
-    assert run("inspect", basin, "--start", "30", "--end", "60") == 0
+    assert run("inspect", basin, "--start", "30", "--end", "60") == 3  # the start that the log states is another
     assert ", 30.0 s" in capsys.readouterr().out
 
 
@@ -240,7 +240,8 @@ def test_the_documented_commands_convert_inspect_and_reckon(run, recordings, tmp
     monkeypatch.chdir(tmp_path)
     printed = []
     for line in re.findall(r"^    sonar-graph (.*)$", section, re.MULTILINE):
-        assert run(*line.split()) == 0
+        # `inspect` doubts the lever arm and the bias of this run, and says so with its status.
+        assert run(*line.split()) == (3 if line.startswith("inspect") else 0)
         printed.append(capsys.readouterr().out)
     assert len(printed) == 3
     assert re.search(r"DVL against IMU: time offset [+-]0\.\d+ ± 0\.\d+ s: no need to act", printed[1])

@@ -63,12 +63,22 @@ def test_every_command_and_group_has_help_that_ends_in_examples(run, path, capsy
 def test_examples_in_help_are_understood(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     files = "dive.mcap vehicle.toml dive.toml dive.bag dive.ddf dive.aris pings.raw reference.json suite.toml"
-    for name in (*files.split(), "dive_sonar.mcap", "labels.json"):
+    for name in (*files.split(), "imu.csv", "dvl.csv", "dive_sonar.mcap", "labels.json"):
         Path(name).touch()
-    for name in ("comparison", "MRCLAM_Dataset6", "DLR", "A-KIT", "StPereDataset", "ros2_bag_folder", "results"):
+    for name in (
+        "comparison",
+        "MRCLAM_Dataset6",
+        "DLR",
+        "A-KIT",
+        "StPereDataset",
+        "ros2_bag_folder",
+        "results",
+        "folder_of_tables",
+    ):
         Path(name).mkdir()
     for path, command in commands().items():
-        examples = [line.split() for line in command.epilog.splitlines() if line.startswith("sonar-graph ")]
+        lines = [line.partition(" > ")[0] for line in command.epilog.splitlines()]
+        examples = [line.split() for line in lines if line.startswith("sonar-graph ")]
         assert examples
         for words in examples:
             assert tuple(words[1 : 1 + len(path)]) == path
@@ -102,4 +112,5 @@ def test_every_command_that_writes_from_a_file_is_tried_in_the_tests_of_outputs(
     of_folders, of_nothing = {"mrclam", "dlr", "akit", "stpere"}, {"basin", "demo"}
     converted = {"rosbag", "didson", "aris", "oculus", "victoria-park"}
     tried = converted | {"compare", "recognise", "landmarks", "calibrate", "join", "label"}  # and live, in tests/live
-    assert writing == tried | of_folders | of_nothing | {"run", "live"}
+    elsewhere = {"run", "live", "figures", "csv"}  # test_show, test_own_files
+    assert writing == tried | of_folders | of_nothing | elsewhere

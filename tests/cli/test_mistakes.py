@@ -49,7 +49,7 @@ MISTAKES = {
     "dance": "dance",
     "compare basin.mcap -o out --speed 9": "--speed",
     "compare missing.mcap -o out": r"missing\.mcap",
-    "inspect empty": "is a directory",
+    "inspect empty": r"empty: is a folder without metadata\.yaml and \.mcap files; give a log",
     "inspect notes.txt": r"notes\.txt",
     "compare notes.txt -o out": r"notes\.txt",
     "compare basin.mcap -o notes.txt": "is a file; give a folder",

@@ -128,10 +128,8 @@ def test_a_model_that_calibrate_wrote_is_used(lane_log, run, tmp_path, monkeypat
     assert re.search(r"^  landmark 1: \d+ frames, 1 track$", said, re.MULTILINE)
     assert re.search(r"^Caution: fewer than 10 tracks of landmark 1, .*more logs", said, re.MULTILINE)
     model = read_confusion(tmp_path / "model.json")
-    sigmas = f"  range sigma {1e3 * model.range_sigma_m:.1f} mm, azimuth sigma {model.azimuth_sigma_rad:.4f} rad, "
-    interval = model.report_interval()
-    every = "every frame is reported" if interval == 1 else f"one frame in {interval} is reported"
-    of_errors = f"error correlation {model.error_correlation:.2f} between frames of a track: {every}\n"
+    sigmas = f"  range sigma {1e3 * model.range_sigma_m:.1f} mm, across {1e3 * model.across_sigma_m:.1f} mm, "
+    of_errors = f"a track is reported every {model.report_interval_s:.1f} s\n"
     assert f"{sigmas}{of_errors}" in said
     assert run("label", lane_log, "-o", tmp_path / "model.json") == 2
     assert "model.json: exists, and holds something else than labels; choose" in capsys.readouterr().err

@@ -1,12 +1,14 @@
 """Headings and position fixes of a simulated vehicle, spoilt by hand: named with the line that puts them right."""
 
+import re
+import tomllib
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.diagnosis import aiding_check
+from sonar_graph.diagnosis import aiding_check, doubts
 from sonar_graph.logs.adapters.log_config import LogConfig
 from sonar_graph.measurements import Heading, PositionFixes
 from sonar_graph.sequence import Sequence
@@ -138,3 +140,30 @@ def test_a_heading_of_another_world_is_told_by_positions_with_the_offset_that_pu
             assert line_of(finding) == pytest.approx({"yaw_offset_rad": before - off_rad}, abs=0.04)
     still = replace(run, dvl=replace(run.dvl, velocity=0 * velocity))
     assert not any(f.estimate.is_known for f in list(aiding_check.heading_findings(still, LogConfig()))[1:])
+
+
+@pytest.mark.parametrize("upside_down", [False, True])
+@pytest.mark.parametrize("reference", ["heading", "truth"])
+def test_a_constant_bias_of_the_gyros_is_found_and_its_line_takes_it_away(reference: str, upside_down: bool):
+    """0.67 degrees a second about the vertical, however the IMU sits."""
+    given = compass(RIGHT, lambda yaw_rad: yaw_rad) if reference == "heading" else RIGHT
+    right = aiding_check.vertical_bias(given)
+    assert right is not None
+    assert not right.acts
+    turn = np.array([1.0, -1.0, -1.0]) if upside_down else np.ones(3)
+    rate = RIGHT.imu.angular_velocity + np.array([0.0, 0.0, np.radians(0.67)])
+    imu = replace(RIGHT.imu, angular_velocity=rate * turn, specific_force=RIGHT.imu.specific_force * turn)
+    biased = replace(given, imu=imu)
+    found = aiding_check.vertical_bias(biased)
+    assert found is not None
+    assert found.acts
+    assert found.estimate.value == pytest.approx(np.radians(0.67), abs=4 * found.estimate.sigma)
+    assert found in doubts(biased, NO_CONFIG)
+    (line,) = re.findall(r"`(imu\.gyro_bias_rad_s = \[.*?\])`", found.text())
+    assert re.search(r"0\.6[67]\d?°/s beyond", found.text())
+    known = tomllib.loads(line)["imu"]["gyro_bias_rad_s"]
+    section = biased.calibration.imu.model_copy(update={"gyro_bias_rad_s": tuple(known)})
+    mended = replace(biased, calibration=biased.calibration.model_copy(update={"imu": section}))
+    again = aiding_check.vertical_bias(mended)
+    assert again is not None
+    assert not again.acts

@@ -7,7 +7,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from sonar_graph.calibration import Calibration, PlanarMotion, Section
+from sonar_graph.calibration import Calibration, PlanarMotion, Section, Start
 from sonar_graph.errors import UnknownEstimatorError
 from sonar_graph.evaluation import run as run_module
 from sonar_graph.measurements import Dvl, Imu, LandmarkDetections, Measurements
@@ -29,7 +29,7 @@ def straight_sequence(duration_s: float = 20.0, *, planar: bool = True, truth: b
     poses = [straight_pose(stamp) for stamp in stamps.tolist()]
     return Sequence(
         name="straight",
-        calibration=Calibration(planar=PlanarMotion() if planar else None),
+        calibration=Calibration(start=Start(), planar=PlanarMotion() if planar else None),
         imu=Imu(stamps, np.zeros((n, 3)), np.tile([0.0, 0.0, 9.80665], (n, 1))),
         dvl=Dvl(stamps, np.tile([SPEED_M_S, 0.0, 0.0], (n, 1)), np.full((n, 3, 3), np.nan)),
         detections=LandmarkDetections(

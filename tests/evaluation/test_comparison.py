@@ -13,8 +13,8 @@ from sonar_graph.evaluation.run import run_estimator
 from sonar_graph.evaluation.scores import detection_scores, landmark_scores, resource_scores
 from sonar_graph.measurements import Imu, LandmarkDetections, Measurements
 from sonar_graph.report import sentences
+from sonar_graph.report.figures.maps import true_landmarks_drawn
 from sonar_graph.report.landmark_table import landmark_table
-from sonar_graph.report.maps import true_landmarks_drawn
 from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, Trajectory
 
 from .conftest import Offset, straight_sequence

@@ -1,7 +1,6 @@
 """``live`` and ``play`` as commands: mistakes in one line, and a rehearsal with a crash in it."""
 
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -11,15 +10,10 @@ import pytest
 from sonar_graph import write_log
 from sonar_graph.cli.main import main
 from sonar_graph.simulation import MissionOptions, simulate_mission
+from tests.live.traffic import free_endpoint
 
 pytest.importorskip("zenoh")
 COMMAND = [sys.executable, "-m", "sonar_graph"]
-
-
-def endpoint():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def said(capsys, *arguments):
@@ -63,7 +57,7 @@ def test_a_live_run_that_is_killed_and_resumed_equals_the_run_on_its_record(tmp_
     """With both ends as commands: play, live, SIGKILL, live --resume, Ctrl-C, run."""
     world = simulate_mission(MissionOptions(duration_s=40.0, frame_rate_hz=5.0))
     write_log(tmp_path / "log.mcap", world)
-    where, go = endpoint(), tmp_path / "go"
+    where, go = free_endpoint(), tmp_path / "go"
     player = subprocess.Popen([*COMMAND, "play", tmp_path / "log.mcap", "--listen", where, "--after", go])
     time.sleep(3.0)
     try:

@@ -9,7 +9,7 @@ from sonar_graph import read_log, recognise
 from sonar_graph.cli.main import main
 from sonar_graph.live import LiveOptions, LiveRun
 from sonar_graph.live.zenoh_link import definition_of
-from sonar_graph.logs import LiveRecord
+from sonar_graph.logs import LiveRecord, PartialCalibration
 from tests.live.traffic import messages_of
 
 LOG_S = 40.0
@@ -22,10 +22,11 @@ def test_live_detections_are_those_of_the_log_and_the_record_has_them(tmp_path):
     with pytest.raises(SystemExit):
         main(["simulate", "basin", "-o", str(log), "--images", "--set", "laps=1", "--set", "duration_s=150"])
     whole = recognise(log)
+    given = PartialCalibration.parse(read_log(log).calibration.model_dump(), "its log")  # messages do not say it
     messages = messages_of(log, np.random.default_rng(0), 0.0)
     last_ns = messages[0].arrival_ns + int(LOG_S * 1e9)
     with LiveRecord(tmp_path / "record.mcap") as record:
-        options = LiveOptions("dead-reckoning", lateness_s=5.0)
+        options = LiveOptions("dead-reckoning", lateness_s=5.0, calibration=given)
         with LiveRun(record, definition_of, options, [], lambda _: None) as run:
             for message in messages:
                 if message.arrival_ns > last_ns:
@@ -43,7 +44,7 @@ def test_live_detections_are_those_of_the_log_and_the_record_has_them(tmp_path):
     assert recorded.detections is not None
     mine, theirs = recorded.detections, whole.detections.between(0, int(recorded.detections.stamps_ns[-1]))
     first = np.searchsorted(theirs.stamps_ns, mine.stamps_ns[0])
-    assert len(mine) >= 8
+    assert len(mine) >= 5
     assert abs(len(mine) - (len(theirs) - first)) <= 2
-    common = np.intersect1d(mine.stamps_ns, theirs.stamps_ns)
-    assert len(common) >= 0.8 * len(np.unique(mine.stamps_ns))
+    common = np.intersect1d(mine.stamps_ns, theirs.stamps_ns)  # beliefs begin later live, so it may report others too
+    assert len(common) >= 0.8 * len(np.unique(theirs.stamps_ns[first:]))

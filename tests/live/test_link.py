@@ -18,16 +18,14 @@ from sonar_graph.live.zenoh_link import definition_of, parse_key, topic_key, typ
 from sonar_graph.logs import PartialCalibration
 from sonar_graph.logs.live_record import LiveRecord
 from sonar_graph.simulation import MissionOptions, simulate_mission
-from tests.live.traffic import messages_of
+from tests.live.traffic import free_endpoint, messages_of
 
 zenoh = pytest.importorskip("zenoh")
 
 
 @pytest.fixture
 def endpoint():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    return free_endpoint()
 
 
 def test_type_hashes_are_those_of_ros():

@@ -1,5 +1,6 @@
 """Messages of a log as they would arrive over a network that delays them."""
 
+import socket
 from pathlib import Path
 
 import numpy as np
@@ -23,3 +24,10 @@ def messages_of(path: Path, noise: np.random.Generator, delay_s: float) -> list[
                 newest_ns[channel.topic] = arrival_ns = max(arrival_ns, newest_ns.get(channel.topic, 0))
                 found.append(Message(channel.topic, schema.name, message.data, arrival_ns))
     return sorted(found, key=lambda message: message.arrival_ns)
+
+
+def free_endpoint() -> str:
+    """Endpoint of zenoh on a free port of the loopback."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"

@@ -11,7 +11,7 @@ from mcap.reader import make_reader
 
 from sonar_graph.errors import LogError
 from sonar_graph.logs.amending import write_amended
-from sonar_graph.logs.mcap.reader import scan
+from sonar_graph.logs.mcap.scanning import scan
 from sonar_graph.logs.mcap.topic import Keep
 from sonar_graph.logs.mcap.writer import Outgoing, is_own_log
 from sonar_graph.logs.writing import landmark_map_message

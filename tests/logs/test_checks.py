@@ -307,3 +307,9 @@ def test_rows_that_do_not_say_their_noise_are_counted() -> None:
         "detections: 5 of 5 rows say no covariance, sonar.range_sigma_m and azimuth_sigma_rad of the calibration count",
     ]
     assert [text.partition(":")[0] for text in unsaid_noise(blocks, only_partly=True)] == ["dvl", "depth"]
+
+
+def test_stamps_of_another_year_are_of_a_log_that_was_played_or_of_a_wrong_clock_not_late():
+    log_times_ns = np.arange(100) * 10_000_000 + 400 * 86_400 * 10**9
+    (said,) = stamp_faults(np.arange(1, 101) * 10_000_000, log_times_ns)
+    assert said == "stamped 400 days before recording: a log was played, or a clock was not set"

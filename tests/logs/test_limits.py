@@ -21,7 +21,7 @@ from sonar_graph.files import text_of
 from sonar_graph.files.inputs import LARGEST_TEXT
 from sonar_graph.logs.cdr import parse_definition
 from sonar_graph.logs.inspection import inspect_log
-from sonar_graph.logs.mcap import Keep, chunks, reader, records
+from sonar_graph.logs.mcap import Keep, chunks, records, scanning
 from sonar_graph.logs.mcap.file_summary import read_summary
 from sonar_graph.logs.mcap.records import MAGIC, LogFile
 from sonar_graph.logs.mcap.writer import write_recording
@@ -51,7 +51,7 @@ def test_a_chunk_of_more_than_the_limit_is_lost_with_limit_and_remedy_before_it_
     for module in (chunks, records):
         monkeypatch.setattr(module, "LARGEST_BYTES", LIMIT)
     path = log_with_chunk(tmp_path / "log.mcap", bytes(size), compression, stated)
-    (loss,) = reader.scan(path, lambda _: Keep.ALL).damage.losses
+    (loss,) = scanning.scan(path, lambda _: Keep.ALL).damage.losses
     if (size, stated) == (LIMIT, LIMIT):
         assert "unread" in loss.reason  # zeros are no records
     elif size > LIMIT and (stated > LIMIT or compression == "zstd") and compression:
@@ -75,11 +75,11 @@ def test_a_chunk_that_is_cut_off_is_unpacked_no_further_than_its_stated_size_and
 def test_messages_far_larger_than_their_file_are_refused(tmp_path: Path, monkeypatch: Any, make_sequence: Any) -> None:
     write_recording(tmp_path / "log.mcap", [imu_messages("/imu", make_sequence().imu)], {})
     size = (tmp_path / "log.mcap").stat().st_size
-    monkeypatch.setattr(reader, "LARGEST_BYTES", 10)
-    reader.scan(tmp_path / "log.mcap", lambda _: Keep.ALL)
-    monkeypatch.setattr(reader, "LARGEST_RATIO", 1 / size)
+    monkeypatch.setattr(scanning, "LARGEST_BYTES", 10)
+    scanning.scan(tmp_path / "log.mcap", lambda _: Keep.ALL)
+    monkeypatch.setattr(scanning, "LARGEST_RATIO", 1 / size)
     with pytest.raises(LogError, match=rf"its {size} bytes unpack to more than .* --start and --end"):
-        reader.scan(tmp_path / "log.mcap", lambda _: Keep.ALL)
+        scanning.scan(tmp_path / "log.mcap", lambda _: Keep.ALL)
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device"])
@@ -170,6 +170,6 @@ def test_a_mounting_that_cannot_be_is_named_unless_the_user_states_it(
     write_recording(path, [tree, imu_messages("/imu", sequence.imu), dvl_messages("/dvl", sequence.dvl)], {})
     with pytest.raises(LogError, match=rf"log\.mcap: dvl: /tf_static: .*{message}.*--calibration"):
         read_log(path)
-    assert any("--calibration" in text for text in inspect_log(path).damage)
+    assert any("--calibration" in text for text in inspect_log(path).unusable)
     stated = PartialCalibration.parse({"dvl": {"mounting": {}}}, "vehicle.toml")
     assert read_log(path, calibration=stated).calibration.dvl.mounting.translation_m == (0.0, 0.0, 0.0)

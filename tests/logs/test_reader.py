@@ -21,8 +21,8 @@ from mcap.writer import CompressionType, IndexType
 
 from sonar_graph.errors import LogError, MissingTopicError
 from sonar_graph.logs.mcap.file_summary import Instant, TimeWindow
-from sonar_graph.logs.mcap.reader import scan, stream
 from sonar_graph.logs.mcap.records import seal
+from sonar_graph.logs.mcap.scanning import scan, stream
 from sonar_graph.logs.mcap.topic import Damage, Keep, Loss, Topic, settle
 from sonar_graph.logs.reading import read_log
 

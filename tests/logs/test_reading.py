@@ -14,7 +14,7 @@ from sonar_graph.logs.adapters.landmark_messages import LandmarkMapAdapter, dete
 from sonar_graph.logs.cdr.definitions import definition
 from sonar_graph.logs.inspection import inspect_log
 from sonar_graph.logs.mcap.file_summary import Instant, TimeWindow
-from sonar_graph.logs.mcap.reader import scan
+from sonar_graph.logs.mcap.scanning import scan
 from sonar_graph.logs.mcap.topic import Keep
 from sonar_graph.logs.reading import read_log
 from sonar_graph.logs.vehicle_setup import PartialCalibration
@@ -212,7 +212,7 @@ def test_a_message_that_breaks_its_rules_is_named(bench: Bench, changed: dict[st
     with pytest.raises(LogError, match=message) as caught:
         read_log(path)
     assert "\n" not in str(caught.value)
-    assert str(caught.value) in inspect_log(path).damage
+    assert str(caught.value) in inspect_log(path).unusable
 
 
 POSTERIOR = "1 with probabilities that are not between 0 and 1 or more than 1 in sum"

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from sonar_graph.calibration import Calibration, DepthCalibration, DvlCalibration, ImuCalibration, Mounting, Start
 from sonar_graph.errors import CalibrationError, LogError
-from sonar_graph.logs.mcap.reader import scan
+from sonar_graph.logs.mcap.scanning import scan
 from sonar_graph.logs.mcap.topic import Keep
 from sonar_graph.logs.mcap.writer import write_recording
 from sonar_graph.logs.reading import read_log

@@ -157,8 +157,8 @@ def test_wrong_ones_of_the_first_rows_are_refused_and_no_others(wrong, hz):
     rows = start(wrong, hz=hz, seconds=3.0 if hz > 1 else 12.0)
     odometry = told(rows)
     assert refused(odometry, rows) == sorted(wrong)
-    assert np.array_equal(odometry._rows()[4][-5:], rows.velocity[-5:])
-    assert np.abs(odometry._rows()[4]).max() == pytest.approx(0.3)
+    assert np.array_equal(odometry.rows()[4][-5:], rows.velocity[-5:])
+    assert np.abs(odometry.rows()[4]).max() == pytest.approx(0.3)
 
 
 @pytest.mark.parametrize("speed", [0.0, 0.3, 1.0, 2.0, 3.0, 5.0, 10.0])
@@ -167,8 +167,8 @@ def test_a_vehicle_that_moves_from_the_start_is_believed_with_its_first_row(spee
     rows = start({}, speed)
     enough = needed(rows.velocity[0])
     assert enough <= min(10, 2 + speed**2 / 4)
-    assert not len(told(rows.rows(slice(0, enough - 1)))._rows()[3])
-    columns = told(rows.rows(slice(0, enough)))._rows()[3:6]
+    assert not len(told(rows.rows(slice(0, enough - 1))).rows()[3])
+    columns = told(rows.rows(slice(0, enough))).rows()[3:6]
     for column, own in zip(columns, (rows.stamps_ns, rows.velocity, rows.velocity_cov), strict=True):
         assert np.array_equal(column, own[:enough])
 
@@ -176,7 +176,7 @@ def test_a_vehicle_that_moves_from_the_start_is_believed_with_its_first_row(spee
 def test_the_start_stays_a_node_with_the_velocity_of_the_first_row_believed():
     """Less surely known: by the walk and what the vehicle may have turned since."""
     rows = start({0: WRONG, 1: WRONG})
-    stamps_ns, velocity, cov = told(rows)._rows()[3:6]
+    stamps_ns, velocity, cov = told(rows).rows()[3:6]
     assert np.array_equal(stamps_ns, rows.stamps_ns)
     assert np.array_equal(velocity, np.tile([0.3, 0.0, 0.0], (len(rows), 1)))
     t = (rows.stamps_ns[2] - rows.stamps_ns[0]) * 1e-9
@@ -196,7 +196,7 @@ def test_blocks_out_of_order_are_believed_as_in_order(seed, order, cuts):
     odometry = Odometry(Calibration())
     for block in np.split(np.array(order), sorted(cuts)):
         odometry.add(None, rows.rows(np.sort(block)))
-    stamps_ns = odometry._rows()[3]
+    stamps_ns = odometry.rows()[3]
     assert (np.diff(stamps_ns) > 0).all()
     told_of = [row.stamp_ns for row in odometry.refused]
     assert sorted([*stamps_ns.tolist(), *told_of]) == ns.tolist()
@@ -211,7 +211,7 @@ def test_wrong_rows_that_go_on_for_long_are_never_believed():
     velocity = np.where(wrong[:, None], 5.0 * directions / np.linalg.norm(directions, axis=1)[:, None], [0.5, 0.0, 0.0])
     rows = dvl(ns, velocity, 1e-4 * np.eye(3))
     for calls in (1, 7, len(ns)):
-        used = np.isin(ns, told(rows, calls)._rows()[3])
+        used = np.isin(ns, told(rows, calls).rows()[3])
         assert not used[wrong].any()
         assert used[~wrong].sum() >= np.count_nonzero(~wrong) - 2
 
@@ -219,7 +219,7 @@ def test_wrong_rows_that_go_on_for_long_are_never_believed():
 def test_a_slow_log_is_not_in_doubt_for_ever():
     for seconds, hz, calls in ((76.0, 0.25, 1), (76.0, 0.25, 20), (190.0, 0.1, 1), (190.0, 0.1, 20)):
         rows = start({}, speed=1.0, hz=hz, seconds=seconds)
-        assert told(rows, calls)._rows()[3].tolist() == rows.stamps_ns.tolist()
+        assert told(rows, calls).rows()[3].tolist() == rows.stamps_ns.tolist()
 
 
 def test_rows_that_confirm_each_other_here_and_there_are_no_majority():
@@ -256,17 +256,17 @@ def test_wrong_rows_after_a_long_gap_are_refused_and_no_others(gap_s, wrong):
     for calls in (1, len(rows)):
         odometry = told(rows, calls)
         assert refused(odometry, rows) == [first + row for row in wrong]
-        assert np.abs(odometry._rows()[4]).max() == pytest.approx(0.3)
+        assert np.abs(odometry.rows()[4]).max() == pytest.approx(0.3)
 
 
 def test_a_gap_lasts_until_its_end_is_confirmed_and_after_a_shorter_one_a_row_is_enough():
     rows, first = after_gap(30.0, {})
-    assert len(told(rows.rows(slice(0, first + 1)))._rows()[3]) == first
+    assert len(told(rows.rows(slice(0, first + 1))).rows()[3]) == first
     ended = told(rows.rows(slice(0, first + 2)))
-    assert ended._rows()[3][first:].tolist() == [rows.stamps_ns[first + 1]]
+    assert ended.rows()[3][first:].tolist() == [rows.stamps_ns[first + 1]]
     assert [(row.stamp_ns, row.reason) for row in ended.refused] == [(rows.stamps_ns[first], Refusal.WAITED)]
     rows, first = after_gap(LONG_NS / NS - 0.3, {})
-    assert len(told(rows.rows(slice(0, first + 1)))._rows()[3]) == first + 1
+    assert len(told(rows.rows(slice(0, first + 1))).rows()[3]) == first + 1
 
 
 def test_rows_of_few_beams_wait_with_the_first_whole_ones():
@@ -275,7 +275,7 @@ def test_rows_of_few_beams_wait_with_the_first_whole_ones():
     cov = rows.velocity_cov.copy()
     cov[[0, 2]] += np.diag([0.0, UNMEASURED_M_S**2, UNMEASURED_M_S**2])
     odometry = told(Dvl(rows.stamps_ns, rows.velocity, cov))
-    assert np.array_equal(odometry._rows()[3], rows.stamps_ns[1:])
+    assert np.array_equal(odometry.rows()[3], rows.stamps_ns[1:])
     assert [(row.stamp_ns, row.reason) for row in odometry.refused] == [(rows.stamps_ns[0], Refusal.INCOMPLETE)]
 
 

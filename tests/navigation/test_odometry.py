@@ -207,7 +207,7 @@ def test_forgetting_drops_rows_of_both_sensors_that_no_motion_needs(calibration,
     """
     odometry = odometry_of(imu(stamps(10, 20.0), 0.0), dvl(stamps(2, 20.0), 0.0), calibration)
     odometry.forget_before(at(15.0))
-    rows = odometry._rows()
+    rows = odometry.rows()
     for stamps_ns, earliest_s in ((rows.imu_ns, 15.0 - ROWS_BEFORE / 10), (rows.dvl_ns, 14.5)):
         assert at(earliest_s - kept_s - 0.1) <= stamps_ns[0] <= at(15.0 - kept_s)
         assert stamps_ns[-1] == at(20.0)

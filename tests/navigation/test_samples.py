@@ -200,7 +200,7 @@ def test_what_is_refused_does_not_depend_on_how_rows_are_cut(cuts):
     whole, pieces = odometry_at_rest(rows), odometry_at_rest(*(rows.between(*ends) for ends in pairwise(edges)))
     assert told(whole) == [(k, Refusal.OUTLIER) for k in outliers]
     assert sorted(pieces.refused) == sorted(whole.refused)
-    for one, other in zip(pieces._rows()[:6], whole._rows()[:6], strict=True):
+    for one, other in zip(pieces.rows()[:6], whole.rows()[:6], strict=True):
         np.testing.assert_array_equal(one, other)
 
 
@@ -218,7 +218,7 @@ def test_rows_of_few_beams_are_named_until_they_are_completed():
     odometry.add(None, rows.rows(slice(9, None)))
     assert told(odometry) == [(k, Refusal.INCOMPLETE) for k in (0, 1, 28, 29, 30)]
     assert np.isnan([row.distance for row in odometry.refused]).all()
-    np.testing.assert_array_equal(odometry._rows()[3], rows.stamps_ns[2:28])
+    np.testing.assert_array_equal(odometry.rows()[3], rows.stamps_ns[2:28])
 
 
 @pytest.mark.parametrize("more_ns", [0, 1])
@@ -227,7 +227,7 @@ def test_rows_of_few_beams_over_too_long_a_stretch_are_named(more_ns):
     odometry = Odometry(Calibration())
     odometry.add(imu(ns[[0, 2]], 0.0), dvl(ns, 0.8, np.array([WHOLE, BLIND, WHOLE])))
     assert [(row.stamp_ns, row.reason) for row in odometry.refused] == [(T0_NS + NS, Refusal.INCOMPLETE)] * more_ns
-    assert len(odometry._rows()[3]) == 3 - more_ns
+    assert len(odometry.rows()[3]) == 3 - more_ns
 
 
 @pytest.mark.parametrize(
@@ -239,7 +239,7 @@ def test_a_row_of_few_beams_waits_to_be_completed_and_for_no_other(partial, bloc
     rows = driven(partial=(partial,))
     odometry = odometry_at_rest(*(rows.rows(np.array(block)) for block in blocks))
     assert told(odometry) == [(partial, Refusal.INCOMPLETE)]
-    np.testing.assert_array_equal(odometry._rows()[3], rows.stamps_ns[used])
+    np.testing.assert_array_equal(odometry.rows()[3], rows.stamps_ns[used])
 
 
 def test_rows_are_late_up_to_the_settled_stamp_and_those_known_already_are_no_news():
@@ -250,12 +250,12 @@ def test_rows_are_late_up_to_the_settled_stamp_and_those_known_already_are_no_ne
     odometry.add(None, rows)
     odometry.add(None, rows.rows(slice(5, 6)))
     assert told(odometry) == [(4, Refusal.LATE)]
-    assert odometry._rows()[3][-1] == rows.stamps_ns[-1]
+    assert odometry.rows()[3][-1] == rows.stamps_ns[-1]
     odometry = Odometry(Calibration())
     odometry.settle(T0_NS)
     odometry.add(None, dvl(T0_NS + np.array([-1, 0, 1, 2]), [0.8, 0.0, 0.0]))
     assert [row.stamp_ns - T0_NS for row in odometry.refused] == [-1, 0]
-    assert (odometry._rows()[3] - T0_NS).tolist() == [1, 2]
+    assert (odometry.rows()[3] - T0_NS).tolist() == [1, 2]
 
 
 def test_of_equal_stamps_the_first_counts():
@@ -264,8 +264,8 @@ def test_of_equal_stamps_the_first_counts():
     across, inside = odometry_at_rest(one), odometry_at_rest(within)
     assert across.add(None, other)
     for odometry in (across, inside):
-        np.testing.assert_array_equal(odometry._rows()[3], one.stamps_ns)
-        np.testing.assert_array_equal(odometry._rows()[4], one.velocity)
+        np.testing.assert_array_equal(odometry.rows()[3], one.stamps_ns)
+        np.testing.assert_array_equal(odometry.rows()[4], one.velocity)
 
 
 @pytest.mark.parametrize(
@@ -274,7 +274,7 @@ def test_of_equal_stamps_the_first_counts():
 def test_repeats_are_left_out_wherever_they_are_in_a_block(offsets, kept):
     odometry = Odometry(Calibration())
     odometry.add(imu(T0_NS + np.array(offsets), 0.0), None)
-    assert (odometry._rows()[0] - T0_NS).tolist() == kept
+    assert (odometry.rows()[0] - T0_NS).tolist() == kept
 
 
 @pytest.mark.parametrize("missing", range(1, 9))
@@ -302,7 +302,7 @@ def test_a_covariance_is_sound_where_it_is_positive_definite_but_for_rounding(ra
     rows.velocity_cov[7] = 1e-4 * (turn * [1.0, 1.0, ratio]) @ turn.T
     odometry = odometry_at_rest(rows)
     assert told(odometry) == ([] if is_sound else [(7, Refusal.UNSOUND)])
-    assert len(odometry._rows()[3]) == len(rows) - (not is_sound)
+    assert len(odometry.rows()[3]) == len(rows) - (not is_sound)
 
 
 def test_only_rows_before_others_ask_for_motion_anew():
@@ -335,7 +335,7 @@ def test_held_velocities_may_jump():
 def test_an_infinite_variance_is_completed_like_one_of_a_direction_not_measured():
     turned = Calibration(dvl=DvlCalibration(mounting=Mounting(rpy_rad=(0.1, 0.2, 0.7))))
     logs = [driven((4, 5), blind=np.diag([SIGMA**2, unmeasured, unmeasured])) for unmeasured in (100.0**2, np.inf)]
-    one, other = (odometry_at_rest(rows, calibration=turned)._rows()[:6] for rows in logs)
+    one, other = (odometry_at_rest(rows, calibration=turned).rows()[:6] for rows in logs)
     for column, same in zip(one, other, strict=True):
         np.testing.assert_array_equal(column, same)
     assert len(one[3]) == len(logs[0])

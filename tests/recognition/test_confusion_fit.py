@@ -18,13 +18,14 @@ from sonar_graph.sonar.confusion import Confusion, confusion_for, soft_scores
 from sonar_graph.sonar.evidence import EVIDENCE
 from sonar_graph.sonar.recogniser import Recogniser, RecogniserParams
 
+BOUND = np.array([0.003, 0.0008])
 IDS, RANGE_M, AZIMUTH_RAD = np.array([5, 3]), np.array([2.0, 1.5]), np.array([0.1, -0.2])
 
 
 def sighting(range_m: float, azimuth_rad: float, *, is_compared: bool = True) -> ObjectSighting:
     evidence = np.outer([0.9, 0.3], np.ones(len(EVIDENCE)))
-    fit = DesignFit(evidence, 0.95, np.zeros(2), np.zeros((2, 2))) if is_compared else None
-    return ObjectSighting(fit, range_m, azimuth_rad, np.eye(2), 0.5, 0.003)
+    fit = DesignFit(evidence, 0.95, np.zeros(2), np.zeros((2, 2)), np.zeros(2, int)) if is_compared else None
+    return ObjectSighting(fit, range_m, azimuth_rad, np.eye(2), 0.5, BOUND if is_compared else None)
 
 
 def test_a_sighting_is_of_what_truly_lies_there():
@@ -49,17 +50,17 @@ def test_sightings_become_columns_with_their_errors():
     for news, seen in enumerate(
         (fitted, sighting(1.49, -0.2), sighting(3.0, 0.1), sighting(2.2, 0.1), sighting(2.0, 0.1, is_compared=False))
     ):
-        gathered.add(seen, (0, 7), news / 4, IDS, RANGE_M, AZIMUTH_RAD)
-    stranger.add(fitted, (0, 1), 1.0, IDS, RANGE_M, AZIMUTH_RAD)
+        gathered.add(seen, 1000 + news, (0, 7), news / 4, IDS, RANGE_M, AZIMUTH_RAD)
+    stranger.add(fitted, 1000, (0, 1), 1.0, IDS, RANGE_M, AZIMUTH_RAD)
     fits = gathered.fits()
     assert fits.label.tolist() == [1, 0, 2]  # in the order of the designs; what is unclear or not compared is left out
     np.testing.assert_allclose(fits.evidence, np.tile(fitted.fit.evidence, (3, 1, 1)))
-    np.testing.assert_allclose(fits.visible, 0.95)
+    np.testing.assert_allclose(fits.bound_m, [BOUND] * 3)
     np.testing.assert_allclose(fits.news, [0, 0.25, 0.5])
     np.testing.assert_allclose(fits.range_per_height, 0.5)
-    np.testing.assert_allclose(fits.bin_m, 0.003)
-    np.testing.assert_allclose(fits.range_azimuth_error[:2], [[0.01, 0.002], [-0.01, 0]], atol=1e-12)
-    assert np.isnan(fits.range_azimuth_error[2]).all()
+    assert fits.stamp_ns.tolist() == [1000, 1001, 1002]
+    np.testing.assert_allclose(fits.error_m[:2], [[0.01, 0.004], [-0.01, 0]], atol=1e-12)
+    assert np.isnan(fits.error_m[2]).all()
     assert stranger.fits().evidence.shape == (0, 2, len(EVIDENCE))
 
 
@@ -100,7 +101,7 @@ def test_a_model_measured_on_a_log_is_of_its_landmarks_and_says_where_it_comes_f
     counts = [int(said[f"frames of {name}"]) for name in (*(f"landmark {k}" for k in measured.ids), "no landmark")]
     assert min(counts) >= 8
     assert measured.range_sigma_m < 0.02
-    assert np.degrees(measured.azimuth_sigma_rad) < 0.5
+    assert measured.across_sigma_m < 0.02
     assert Recogniser(lane.sequence.calibration, params=RecogniserParams(confusion=measured)).confusion is measured
 
 
@@ -160,13 +161,13 @@ def _fits(per_class: int, noise: float, seed: int = 0, scale: float = 1.0) -> co
     n = len(label)
     return confusion_fit.LabelledFits(
         odds[..., None] * direction,
-        np.ones(n),
+        np.tile(BOUND, (n, 1)),
         label,
         np.arange(n),
         np.ones(n),
         error,
         np.full(n, 0.5),
-        np.full(n, 0.003),
+        np.arange(n) * 10**9,
     )
 
 
@@ -204,14 +205,14 @@ def test_matrix_is_the_posterior_mean_of_the_scores_of_each_class():
         np.testing.assert_allclose(np.array(model.matrix)[k], expected)
     assert model.provenance["origin"] == "made up"
     assert model.provenance["frames of landmark 1"] == "100"
-    sigmas = model.range_sigma_m, model.azimuth_sigma_rad
+    sigmas = model.range_sigma_m, model.across_sigma_m
     assert sigmas == pytest.approx((0.01, 0.002), rel=0.2)
 
 
 def test_a_height_of_the_faces_is_a_bias_and_not_noise():
     """Faces 24 mm over the landmarks' places are seen 12 mm nearer where the sonar is half as high as they are far."""
     fits = _fits(300, 1.0)
-    near = replace(fits, range_azimuth_error=fits.range_azimuth_error - np.array([0.012, 0.0]))
+    near = replace(fits, error_m=fits.error_m - np.array([0.012, 0.0]))
     model = confusion_fit.estimate_confusion(near, (1, 2), {})
     assert model.height_bias_m == pytest.approx(0.024, abs=0.002)
     assert model.range_sigma_m == pytest.approx(0.01, rel=0.1)
@@ -227,7 +228,7 @@ def test_a_track_counts_once_for_the_height_however_long_it_is_watched():
     """Two landmarks, 1 and 3 cm higher than their places; the second is watched for ten frames as long."""
     fits = some(_fits(20, 0.1), np.array([0, *[1] * 10]))
     off = np.array([-0.01, *[-0.03] * 10])
-    fits = replace(fits, range_azimuth_error=np.column_stack([off, 0 * off]), range_per_height=np.ones(11))
+    fits = replace(fits, error_m=np.column_stack([off, 0 * off]), range_per_height=np.ones(11))
     assert confusion_fit.without_height(fits)[0] == pytest.approx(0.02)
 
 
@@ -245,36 +246,45 @@ def test_a_class_with_too_few_frames_is_named():
         confusion_fit.estimate_confusion(some(_fits(100, 0.1), np.arange(205)), (1, 2), {})
 
 
-def test_sigmas_are_root_mean_squares_of_a_landmark_that_is_wholly_in_view():
+def test_sigmas_are_root_mean_squares_at_the_usual_bound():
     """A landmark that is always seen 3 cm too far errs by that, and not by the spread about the mean."""
-    fits = _fits(300, 0.1)
-    fits = replace(fits, range_per_height=np.zeros(900))
-    off = replace(fits, range_azimuth_error=fits.range_azimuth_error + np.array([0.03, -0.005]))
-    cut = replace(fits, visible=np.full(900, 0.7), range_azimuth_error=fits.range_azimuth_error / 0.7**2)
-    model, partly = (confusion_fit.estimate_confusion(f, (1, 2), {}) for f in (off, cut))
+    fits = replace(_fits(300, 0.1), range_per_height=np.zeros(900))
+    off = replace(fits, error_m=fits.error_m + np.array([0.03, -0.005]))
+    model = confusion_fit.estimate_confusion(off, (1, 2), {})
     sigmas = np.hypot([0.03, 0.005], [0.01, 0.002])
-    assert [model.range_sigma_m, model.azimuth_sigma_rad] == pytest.approx(sigmas, rel=0.05)
-    assert partly.range_sigma_m == pytest.approx(0.01, rel=0.15)
-    variances = np.nanmean(cut.range_azimuth_error**2, axis=0)
+    assert [model.range_sigma_m, model.across_sigma_m] == pytest.approx(sigmas, rel=0.05)
+    variances = np.nanmean(off.error_m**2, axis=0)
     np.testing.assert_allclose(
-        np.diag(partly.range_azimuth_cov(np.array([0.7]), 0.003)[0]), variances * 600 / 599, rtol=1e-9
+        np.diag(model.range_azimuth_cov(BOUND[None], np.ones(1))[0]), variances * 600 / 599, rtol=1e-9
     )
 
 
-def test_longer_bins_have_fewer_looks_and_shorter_ones_are_not_known_to_be_better():
-    """Half of the frames from bins four times as long, with errors twice as large."""
-    fits = _fits(300, 1.0)
-    far = np.arange(900) % 5 < 2
-    scale = np.where(far, 2.0, 1.0)[:, None]
-    mixed = replace(fits, bin_m=np.where(far, 0.012, 0.003), range_azimuth_error=fits.range_azimuth_error * scale)
-    model = confusion_fit.estimate_confusion(mixed, (1, 2), {})
-    assert model.bin_m == 0.003
-    assert [model.range_sigma_m, model.azimuth_sigma_rad] == pytest.approx((0.01, 0.002), rel=0.1)
-    near, long, short = (model.range_azimuth_cov(np.array([0.9]), bin_m) for bin_m in (0.003, 0.012, 0.001))
-    np.testing.assert_allclose(long, 4 * near)
-    np.testing.assert_array_equal(short, near)
-    anywhere = model.model_copy(update={"bin_m": None})
-    np.testing.assert_array_equal(anywhere.range_azimuth_cov(np.array([0.9]), 0.012), near)
+@pytest.mark.parametrize(("power", "within"), [(1.0, 0.05), (2.2, 0.05)])
+def test_the_power_of_the_bound_is_found_and_its_covariances_fit_good_and_bad_fits_alike(power: float, within: float):
+    """Bounds spread over a factor of 30, of range and azimuth apart, and errors that grow with their power."""
+    fits, rng = replace(_fits(2000, 0.1), range_per_height=np.zeros(6000)), np.random.default_rng(3)
+    times = np.exp(rng.uniform(-1.7, 1.7, (6000, 2)))
+    spread = replace(fits, bound_m=BOUND * times, error_m=fits.error_m * times**power)
+    model = confusion_fit.estimate_confusion(spread, (1, 2), {})
+    assert model.bound_power == pytest.approx(power, rel=within)
+    seen = fits.label < 2
+    nis = spread.error_m**2 / np.diagonal(model.range_azimuth_cov(spread.bound_m, np.ones(6000)), axis1=1, axis2=2)
+    for rows in (seen[:, None] & (times > 2), seen[:, None] & (times < 0.5)):
+        assert nis[rows].mean() == pytest.approx(1, abs=0.12)
+
+
+def test_a_few_tracks_leave_the_power_of_the_bound_as_it_is():
+    """Eight tracks of each class whose errors do not depend on the bound at all."""
+    spread = replace(_fits(8, 0.1), bound_m=BOUND * np.exp(np.linspace(-0.3, 0.3, 24))[:, None])
+    model = confusion_fit.estimate_confusion(spread, (1, 2), {})
+    assert 0.8 * PRIOR.bound_power < model.bound_power <= PRIOR.bound_power
+
+
+def test_a_track_counts_once_for_the_accuracy_however_long_it_is_watched():
+    """One track errs by 1 cm for 100 frames, another one by 3 cm for one."""
+    error = np.array([[0.01, 0.001]] * 100 + [[0.03, 0.003]])
+    _, sigmas, _ = confusion_fit.accuracy(error, np.tile(BOUND, (101, 1)), np.arange(101) // 100, 1.5)
+    np.testing.assert_allclose(sigmas**2, [2 * 5e-4, 2 * 5e-6])  # n - 1 of two tracks
 
 
 def test_frames_of_a_track_count_together():
@@ -288,28 +298,28 @@ def test_frames_of_a_track_count_together():
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.7])
-def test_the_correlation_of_errors_is_that_of_successive_frames_of_a_track(rho):
-    rng = np.random.default_rng(5)
-    tracks, frames = 40, 100
+@pytest.mark.parametrize("offset", [0.0, 1.0])
+def test_reports_of_a_track_are_as_many_as_the_mean_of_its_frames_is_worth(rho: float, offset: float):
+    """Autoregressive errors in 400 tracks of 60 frames in 30 s, alone and with an offset of each track."""
+    rng, tracks, frames = np.random.default_rng(5), 400, 60
     errors = rng.standard_normal((tracks, frames, 2))
     for k in range(1, frames):
         errors[:, k] = rho * errors[:, k - 1] + np.sqrt(1 - rho**2) * errors[:, k]
-    order = rng.permuted(np.tile(np.arange(tracks), frames))  # tracks are seen side by side
-    row = np.zeros(tracks, dtype=int)
-    error, track = [], []
-    for which in order.tolist():
-        error.append(errors[which, row[which]])
-        track.append(which)
-        row[which] += 1
-    of = np.array(track)
-    assert confusion_fit.error_correlation(np.array(error) * [1e-3, 4e-4], of) == pytest.approx(rho, abs=0.03)
-    assert confusion_fit.error_correlation(np.full((len(order), 2), np.nan), of) == 0.0
+    errors += offset * rng.standard_normal((tracks, 1, 2))
+    errors /= np.sqrt(1 + offset**2)
+    of, stamp_ns = np.tile(np.arange(tracks), frames), np.repeat(np.arange(frames), tracks) * 10**9 // 2
+    found_s = confusion_fit.report_interval_s(errors.transpose(1, 0, 2).reshape(-1, 2), of, stamp_ns, 0.0)
+    lag = np.abs(np.subtract.outer(np.arange(frames), np.arange(frames)))
+    product = (rho**lag + offset**2 * np.ones_like(lag)) / (1 + offset**2)
+    common = (product.sum() - frames) / (frames * (frames - 1))
+    assert found_s == pytest.approx(29.5 * common * tracks / (tracks + 16), rel=0.1, abs=0.3)
 
 
-def test_a_track_seen_backwards_has_the_same_correlation():
-    error = np.outer([1.0, 0.5, 0.25, 0.1], [1e-3, 4e-4])
-    there, back = (confusion_fit.error_correlation(e, np.zeros(4, dtype=int)) for e in (error, error[::-1]))
-    assert 0 < there == pytest.approx(back)
+def test_the_interval_of_reports_of_a_few_tracks_is_mostly_the_prior():
+    errors, of = np.tile(np.random.default_rng(1).standard_normal((20, 2)), (2, 1)), np.repeat(np.arange(4), 10)
+    stamp_ns = np.arange(40) * 10**9
+    assert confusion_fit.report_interval_s(errors, of, stamp_ns, 3.0) == pytest.approx(3.0, abs=1.0)
+    assert confusion_fit.report_interval_s(np.full((40, 2), np.nan), of, stamp_ns, 3.0) == 3.0
 
 
 def test_roughness_is_the_range_of_all_but_one_track_in_twenty_however_long_they_are():

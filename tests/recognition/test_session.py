@@ -83,13 +83,15 @@ def test_range_and_azimuth_are_as_accurate_as_their_covariance_says(lane):
 
 def test_detections_are_a_part_of_those_of_every_frame_as_often_as_the_model_says(lane, lane_recognition):
     found, every = lane_recognition.detections, recognised(lane, params=EVERY).detections
-    interval = confusion_for(DEFAULT_DESIGNS).report_interval()
+    interval_ns = confusion_for(DEFAULT_DESIGNS).report_interval_s * 1e9
     rows = {(stamp, track): row for row, (stamp, track) in enumerate(zip(every.stamps_ns, every.track, strict=True))}
     chosen = np.array([rows[key] for key in zip(found.stamps_ns, found.track, strict=True)])
     assert_same_detections(found, every.rows(chosen))
-    counts = np.array([[np.sum(block.track == track) for block in (found, every)] for track in np.unique(every.track)])
-    assert (counts[:, 0] >= np.ceil(counts[:, 1] / interval)).all(), "every track, and never more rarely"
-    assert counts[:, 0].sum() < 0.4 * counts[:, 1].sum()
+    for track in np.unique(every.track):
+        reported, seen = (block.stamps_ns[block.track == track] for block in (found, every))
+        due = [stamp for stamp in seen if not ((reported <= stamp) & (reported > stamp - interval_ns)).any()]
+        assert not due, "every track, and never more rarely"
+    assert len(found) < 0.4 * len(every)
 
 
 def test_designs_under_other_names_give_other_names(lane):
@@ -281,7 +283,7 @@ def test_the_lens_of_the_calibration_puts_azimuths_right(lane, lens, is_right):
     found = recognised(told, frames, params=EVERY).detections
     ids, errors = truth_of(lane, found)
     named = errors[found.most_probable()[0] == ids, 1]
-    assert len(named) > 40
+    assert len(named) > 20
     assert (np.degrees(np.median(np.abs(named))) < 0.1) == is_right
 
 

@@ -22,7 +22,7 @@ from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.sensors import dvl_readings, imu_readings, regular_stamps, seconds_since_start
 from sonar_graph.simulation.vehicle import VehiclePath, rpy_from_rotation, smooth_noise
 from sonar_graph.sonar.geometry import FloorView
-from sonar_graph.sonar.track_filter import SonarStep
+from sonar_graph.sonar.tracker import SonarStep
 
 FLOOR_Z_M = -1.7
 MOUNTED = Calibration(

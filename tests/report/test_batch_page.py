@@ -13,11 +13,11 @@ from sonar_graph.batch.gate import bless, gate
 from sonar_graph.batch.recorded import RecordedBatch, read_batch
 from sonar_graph.batch.result_table import metrics_of
 from sonar_graph.errors import EvaluationError
-from sonar_graph.report.batch_figures import WIDTH_IN, folded, log_panels, spread_out
+from sonar_graph.report.batch_figures import folded, log_panels, spread_out
 from sonar_graph.report.batch_page import render_batch, write_batch_report
-from sonar_graph.report.batch_summary import lost_told, marked, missing_told
+from sonar_graph.report.batch_summary import absent_told, lost_told, marked, missing_told
 from sonar_graph.report.batch_tables import all_tests, failure_table
-from sonar_graph.report.figure_style import colour
+from sonar_graph.report.figure_style import PAGE_WIDTH_IN, colour, sized
 from tests.recorded_batches import ESTIMATORS, LOGS, drawn_batch, failed, with_failures, with_missing, write_batch
 
 ATE = "causal.ate_se2_m"
@@ -99,6 +99,13 @@ def test_missing_runs_are_counted_and_are_no_failures(incomplete):
     assert "not_run" not in rows(complete)[LOGS[0], "isam2"]
     assert marked(complete, table := failure_table(complete)) is table
     assert missing_told(complete) == []
+
+
+def test_logs_whose_data_was_absent_are_named_with_their_source():
+    suite = "".join(f'[[logs]]\nname = "{name}"\nobtain = "the source"\n' for name in (LOGS[0], "elsewhere"))
+    batch = replace(drawn_batch(1), suite=suite)
+    assert absent_told(batch) == ["Left out, because its data was not there: elsewhere. Get the source."]
+    assert absent_told(replace(batch, suite="")) == absent_told(replace(batch, suite="no toml [")) == []
 
 
 def test_missing_runs_make_no_pairs_and_no_values(incomplete):
@@ -194,12 +201,13 @@ def test_rows_whose_runs_are_not_here_are_told_and_lead_nowhere(tmp_path):
 def test_many_logs_stand_beside_each_other_with_names_at_the_left_and_folded_headings(logs, shape):
     names = tuple(f"tracks, wrong_id_rate=0.0{index}" for index in range(logs))
     batch = drawn_batch(1, logs=names)
-    figure, panels = log_panels(batch, list(names), "error (m)")
+    with sized(PAGE_WIDTH_IN):
+        figure, panels = log_panels(batch, list(names), "error (m)")
     headings = [panel.get_title(loc="left") for panel in panels]
     assert [heading.replace("\n", " ") for heading in headings] == list(names)
     assert ["\n" in heading for heading in headings] == [logs > 2] * logs
     grid = panels[0].get_subplotspec().get_gridspec()
-    assert (len(figure.axes), figure.get_figwidth(), (grid.nrows, grid.ncols)) == (logs, WIDTH_IN, shape)
+    assert (len(figure.axes), figure.get_figwidth(), (grid.nrows, grid.ncols)) == (logs, PAGE_WIDTH_IN, shape)
     shown = [[label.get_text() for label in panel.get_yticklabels()] for panel in panels]
     assert shown == [[""] * 3 if place % shape[1] else batch.contestants for place in range(logs)]
     colours = [label.get_color() for label in panels[0].get_yticklabels()]

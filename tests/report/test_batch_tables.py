@@ -14,11 +14,11 @@ from sonar_graph.batch.recorded import ALL_LOGS, RecordedBatch
 from sonar_graph.batch.result_table import KINDS, Metric, metrics_of
 from sonar_graph.batch.statistics import paired, quantile_error
 from sonar_graph.evaluation.digits import quantile_text
-from sonar_graph.evaluation.tables import Cell, Column, Table
 from sonar_graph.report import batch_summary as summary
 from sonar_graph.report import batch_tables as tables
 from sonar_graph.report.batch_figures import consistency_drawing, difference_drawing
 from sonar_graph.report.rendering import as_csv, as_latex, csv_text, latex_text, write_tables
+from sonar_graph.table import Cell, Column, Table
 from tests.recorded_batches import LOGS, METRICS, changed, drawn_batch, failed, updated, with_failures, without
 
 ATE, YAW = metrics_of(["causal.ate_se2_m", "causal.yaw_rmse_rad"])

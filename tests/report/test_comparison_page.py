@@ -12,12 +12,13 @@ from sonar_graph.evaluation import compare
 from sonar_graph.evaluation.consistency import reliability, reliability_of
 from sonar_graph.evaluation.results import Comparison, Score
 from sonar_graph.evaluation.scored_instants import published_maps
-from sonar_graph.evaluation.tables import Table, score_keys, score_table
+from sonar_graph.evaluation.tables import score_keys, score_table
 from sonar_graph.recognition.session import with_detections
 from sonar_graph.report.comparison_page import recognition_content, render_report, write_page, write_report
 from sonar_graph.report.figures import reliability_figure
 from sonar_graph.simulation import BasinOptions, simulate_basin
 from sonar_graph.states import Outcome
+from sonar_graph.table import Table
 from tests.synthetic import REFUSALS, basin_comparison, only, with_failure, with_run, with_score
 
 from .test_pages import Page
@@ -109,7 +110,7 @@ def test_without_landmarks_no_figure_of_them_is_announced(comparison):
     for shown, said in ((alone, "No run reports what became of"), (blind, "The log has no landmark detections.</p>")):
         html = render_report(shown)
         figures = re.findall(r'<figure id="figure-(\w+)"', html)
-        assert figures == ["map", "errors", "own_map", "yaw", "nees", "timing"]
+        assert figures == ["map", "errors", "bounds", "own_map", "yaw", "nees", "timing"]
         assert html.count(said) == 1
     assert {"growth", "innovations", "nis"} <= set(re.findall(r'<figure id="figure-(\w+)"', render_report(comparison)))
 
@@ -186,7 +187,7 @@ def test_the_report_holds_pictures_and_warnings_with_their_time(recognised):
     warned = replace(recognised, recognition=replace(recognised.recognition, warnings=warnings))
     content = recognition_content(warned)
     assert texts(content["warnings"]) == {"1.25": ["<b> & so on"]}
-    page = render_report(warned).split('id="recognition"')[1].split("</section>")[0]
+    page = render_report(warned).split('<h2 id="recognition"')[1].split("</section>")[0]
     assert all(shown in page for shown in ("1.25", "&lt;b&gt; &amp; so on", content["expected_error"]))
     assert "<b> & so on" not in page
     assert page.count("data:image/jpeg;base64,") == 4

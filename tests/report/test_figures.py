@@ -2,12 +2,14 @@
 
 import re
 from dataclasses import replace
+from itertools import combinations
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 from matplotlib.patches import Ellipse
 from scipy.stats import chi2
@@ -15,21 +17,30 @@ from scipy.stats import chi2
 from sonar_graph.evaluation.results import Comparison, MapSoFar
 from sonar_graph.evaluation.scored_instants import map_instants, published_maps
 from sonar_graph.report import figures
-from sonar_graph.report.comparison_page import illustrations
-from sonar_graph.report.figure_style import colour, evenly, inline_svg, thinned
-from sonar_graph.report.maps import LARGEST_ELLIPSE, enlargement, growth_figure, map_figure, map_view, paths_cut_off
+from sonar_graph.report.figure_style import arrange, colour, evenly, inline_svg, sized, thinned
+from sonar_graph.report.figures.error_figures import errors_cut_off
+from sonar_graph.report.figures.illustrations import illustrations
+from sonar_graph.report.figures.maps import (
+    LARGEST_ELLIPSE,
+    enlargement,
+    growth_figure,
+    map_figure,
+    map_view,
+    paths_cut_off,
+)
 from sonar_graph.states import LandmarkMap
 from tests.synthetic import basin_comparison, only, with_failure, with_run
 
-TIME = "time since start (s)"
+TIME, DISTANCE = "time since start (s)", "distance travelled (m)"
 FIGURES = {
-    map_figure: ("world x (m)", {"world y (m)"}),
-    figures.error_figure: (TIME, {"error in x (m)", "error in y (m)", "yaw error (°)"}),
-    figures.yaw_figure: (TIME, {"yaw (°)"}),
-    figures.nees_figure: (TIME, {"position NEES / dof", "yaw NEES / dof"}),
-    figures.innovation_figure: (TIME, {"range (m)", "azimuth (°)"}),
-    figures.nis_figure: ("NIS", {"detections below (%)"}),
-    figures.timing_figure: ("duration of an update (ms)", {"updates at most as long (%)"}),
+    map_figure: ({"world x (m)"}, {"world y (m)"}),
+    figures.error_figure: ({TIME, DISTANCE}, {"position error (m)", "yaw error (°)"}),
+    figures.bounds_figure: ({TIME}, {"error in x (m)", "error in y (m)", "yaw error (°)"}),
+    figures.yaw_figure: ({TIME}, {"yaw (°)"}),
+    figures.nees_figure: ({TIME}, {"position NEES / dof", "yaw NEES / dof"}),
+    figures.innovation_figure: ({TIME}, {"range (m)", "azimuth (°)"}),
+    figures.nis_figure: ({"NIS"}, {"detections below (%)"}),
+    figures.timing_figure: ({"duration of an update (ms)"}, {"updates at most as long (%)"}),
 }
 """Every figure, with the labels of its axes."""
 
@@ -37,7 +48,7 @@ FIGURES = {
 @pytest.mark.parametrize("draw", FIGURES)
 def test_a_figure_is_a_well_formed_svg_with_quantities_and_units_in_the_colours_of_the_page(comparison, draw):
     figure, (x, y) = draw(comparison), FIGURES[draw]
-    assert {panel.get_xlabel() for panel in figure.axes} - {""} == {x}
+    assert {panel.get_xlabel() for panel in figure.axes} - {""} == x
     assert {panel.get_ylabel() for panel in figure.axes} - {""} == y
     svg = inline_svg(figure, "figure", 'says "<x>" & more')
     root = ElementTree.fromstring(svg)
@@ -50,10 +61,12 @@ def test_a_figure_is_a_well_formed_svg_with_quantities_and_units_in_the_colours_
 
 
 def test_height_is_drawn_of_three_dimensional_runs_and_no_error_without_truth():
-    figure = figures.error_figure(basin_comparison(60, planar=False))
+    figure = figures.bounds_figure(basin_comparison(60, planar=False))
     assert "error in z (m)" in {panel.get_ylabel() for panel in figure.axes}
     comparison = basin_comparison(60, truth=False)
-    assert [draw for draw in FIGURES if draw(comparison) is None] == [figures.error_figure, figures.nees_figure]
+    assert [draw for draw in FIGURES if draw(comparison) is None] == [
+        *(figures.error_figure, figures.bounds_figure, figures.nees_figure)
+    ]
 
 
 def test_two_inline_svgs_share_no_identifier(comparison):
@@ -87,7 +100,7 @@ def comparison() -> Comparison:
 
 def test_errors_and_their_band_are_drawn_in_their_units(comparison):
     name = "ekf-slam"
-    figure = figures.error_figure(only(comparison, name))
+    figure = figures.bounds_figure(only(comparison, name))
     errors = comparison.errors[name]["causal"]
     x_line, yaw_line = figure.axes[0].lines[-1], figure.axes[2].lines[-1]
     np.testing.assert_allclose(x_line.get_ydata(), errors.position_m[:, 0])
@@ -102,8 +115,59 @@ def test_no_band_is_drawn_where_no_covariance_was_reported(comparison):
     errors = comparison.errors["isam2"]["causal"]
     unknown = {name: np.nan * getattr(errors, name) for name in ("position_sigma_m", "yaw_sigma_rad")}
     silent = replace(only(comparison, "isam2"), errors={"isam2": {"causal": replace(errors, **unknown)}})
-    assert not any(panel.collections for panel in figures.error_figure(silent).axes)
-    assert any(panel.collections for panel in figures.error_figure(comparison).axes)
+    assert not any(panel.collections for panel in figures.bounds_figure(silent).axes)
+    assert any(panel.collections for panel in figures.bounds_figure(comparison).axes)
+
+
+def test_errors_of_all_runs_share_their_axes_and_grow_over_the_distance_travelled(comparison):
+    figure = figures.error_figure(comparison)
+    over_time, over_distance = figure.axes[:2]
+    truth = comparison.sequence.truth
+    travelled = np.linalg.norm(np.diff(truth.at(comparison.instants_ns).positions, axis=0), axis=1).sum()
+    for line, run in zip(over_distance.lines, comparison.runs, strict=True):
+        errors = comparison.errors[run.estimator]["causal"]
+        np.testing.assert_allclose(line.get_ydata().max(), np.hypot(*errors.position_m[:, :2].T).max())
+        np.testing.assert_allclose(line.get_xdata()[-1], travelled)
+    assert over_time.get_ylim() == over_distance.get_ylim()
+    assert figure.axes[2].get_ylim()[1] >= 0
+
+
+def test_a_run_that_is_far_worse_leaves_the_picture_and_is_named(comparison):
+    assert errors_cut_off(only(comparison, "isam2", "ekf-slam")) == []
+    lost = replace(
+        (errors := comparison.errors["dead-reckoning"]["causal"]),
+        position_m=errors.position_m + np.array([100.0, 0, 0]),
+    )
+    far = replace(comparison, errors={**comparison.errors, "dead-reckoning": {"causal": lost}})
+    assert errors_cut_off(far) == ["dead-reckoning"]
+    best = np.hypot(*comparison.errors["isam2"]["causal"].position_m[:, :2].T).max()
+    assert best < figures.error_figure(far).axes[0].get_ylim()[1] < 20 * best
+    assert "Leaves the picture: dead-reckoning." in illustrations(far)["errors"].caption
+
+
+@pytest.mark.parametrize("draw", FIGURES)
+def test_nothing_overlaps_and_nothing_leaves_the_figure(comparison, draw):
+    """Labels stand beside the numbers, panels beside each other, all within the paper."""
+    with sized():
+        figure = draw(comparison)
+        arrange(figure)
+        FigureCanvasAgg(figure).draw()
+    width, height = figure.get_size_inches() * figure.dpi
+    boxes = [panel.get_tightbbox() for panel in figure.axes]
+    for panel, box in zip(figure.axes, boxes, strict=True):
+        assert -1 <= box.x0 < box.x1 <= width + 1
+        assert -1 <= box.y0 < box.y1 <= height + 1
+        written = [text.get_window_extent() for text in panel.get_yticklabels() if text.get_text()]
+        numbers = [one for one in written if panel.bbox.y0 <= (one.y0 + one.y1) / 2 <= panel.bbox.y1]
+        assert numbers or not panel.get_subplotspec().is_first_col()
+        label = panel.yaxis.label
+        if label.get_text() and panel.get_subplotspec().is_first_col():
+            assert all(label.get_window_extent().x1 <= number.x0 + 1 for number in numbers)
+    for one, other in combinations(boxes, 2):
+        assert not one.overlaps(other)
+    for legend in figure.legends:
+        assert legend.get_window_extent().x1 <= width + 1
+        assert all(legend.get_window_extent().y0 >= box.y1 - 1 for box in boxes)
 
 
 def test_yaw_is_never_joined_across_the_wrap(comparison):
@@ -137,9 +201,9 @@ def test_estimators_keep_their_colour_when_another_one_fails(comparison, draw):
 
 def test_every_nees_stays_in_view(comparison):
     figure = figures.nees_figure(comparison)
-    for panel, run in zip(figure.axes, comparison.runs, strict=False):
+    for run in comparison.runs:
         errors = comparison.errors[run.estimator]["causal"]
-        assert panel.get_ylim()[1] > np.nanmax(errors.nees_position) / errors.position_dof
+        assert figure.axes[0].get_ylim()[1] > np.nanmax(errors.nees_position) / errors.position_dof
 
 
 @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=400), st.integers(4, 60))

@@ -3,11 +3,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sonar_graph.evaluation.digits import ABSENT
 from sonar_graph.evaluation.results import Comparison
 from sonar_graph.evaluation.scored_instants import published_maps
 from sonar_graph.report.landmark_table import MOST_LANDMARKS, PAPER, landmark_table, landmarks_left_out
 from sonar_graph.states import LandmarkMap, Trajectory
+from sonar_graph.table import ABSENT
 from tests.synthetic import basin_comparison, only, with_run
 
 MINUS = "\N{MINUS SIGN}"

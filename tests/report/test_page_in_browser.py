@@ -13,8 +13,10 @@ from typing import Any
 
 import pytest
 
+from sonar_graph.report import write_page
 from sonar_graph.report.batch_page import write_batch_report
 from tests.recorded_batches import LOGS, drawn_batch, with_failures
+from tests.synthetic import basin_comparison
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -33,6 +35,11 @@ def page_file(tmp_path_factory) -> Path:
 def page_of_many_logs(tmp_path_factory) -> Path:
     logs = tuple(f"tracks, wrong_id_rate={rate}" for rate in range(9))
     return write_batch_report(drawn_batch(6, logs=logs), tmp_path_factory.mktemp("many"))
+
+
+@pytest.fixture(scope="module")
+def comparison_file(tmp_path_factory) -> Path:
+    return write_page(basin_comparison(240), tmp_path_factory.mktemp("comparison"))
 
 
 @pytest.fixture(scope="module")
@@ -75,6 +82,40 @@ def test_nothing_is_said_in_the_console_nothing_sticks_out_and_the_head_fits_a_s
     with opened(browser, broken, width) as (page, said):  # the checks can fail
         assert page.evaluate(wide) > width
         assert any("nothing is not defined" in line for line in said)
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [PHONE, DESKTOP])
+def test_a_comparison_shows_its_sentence_and_the_whole_map_on_the_first_screen(browser, comparison_file, width, scheme):
+    box = "document.querySelector('{}').getBoundingClientRect()"
+    with opened(browser, comparison_file, width, scheme) as (page, said):
+        assert page.evaluate("document.querySelector('.headline').textContent").startswith(
+            "isam2 is nearest to the truth"
+        )
+        assert (
+            0
+            < page.evaluate(box.format(".headline") + ".bottom")
+            < page.evaluate(box.format("#figure-map svg") + ".top")
+        )
+        assert page.evaluate(box.format("#figure-map svg") + ".bottom") <= 900
+        assert page.evaluate(box.format("#figure-map svg") + ".right") <= width
+        ink, paper = page.evaluate(
+            "[getComputedStyle(document.querySelector('#figure-map svg text')).fill, "
+            "getComputedStyle(document.body).backgroundColor]"
+        )
+        assert (sum(_rgb(ink)) > sum(_rgb(paper))) == (scheme == "dark")
+        page.evaluate("document.querySelectorAll('details').forEach(one => one.open = true)")
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        assert said == []
+
+
+def test_folded_chapters_of_a_comparison_stand_on_paper(browser, comparison_file):
+    folded = "[...document.querySelectorAll('details.chapter > :not(summary)')]"
+    with opened(browser, comparison_file, DESKTOP) as (page, _):
+        assert page.evaluate(f"{folded}.length") > 5
+        assert not page.evaluate(f"{folded}.some(one => one.checkVisibility())")
+        page.emulate_media(media="print")
+        assert page.evaluate(f"{folded}.every(one => one.checkVisibility())")
 
 
 def test_paper_has_folded_tables_no_buttons_and_light_colours(browser, page_file, page_of_many_logs, tmp_path):
@@ -140,8 +181,9 @@ def test_a_number_of_runs_opens_the_list_of_them_and_data_of_a_figure_can_be_dow
 
 @pytest.mark.skipif(not AXE.is_file(), reason="no axe-core: npm install axe-core, or set SONAR_GRAPH_AXE")
 @pytest.mark.parametrize(("width", "scheme"), [(PHONE, "light"), (DESKTOP, "dark")])
-def test_axe_finds_nothing_serious(browser, page_file, width, scheme):
-    with opened(browser, page_file, width, scheme) as (page, _):
+@pytest.mark.parametrize("kind", ["page_file", "comparison_file"])
+def test_axe_finds_nothing_serious(browser, request, kind, width, scheme):
+    with opened(browser, request.getfixturevalue(kind), width, scheme) as (page, _):
         page.evaluate("document.querySelectorAll('details').forEach(one => one.open = true)")
         page.evaluate(AXE.read_text("utf-8"))
         found = _serious(page)

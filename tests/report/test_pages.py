@@ -9,11 +9,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from sonar_graph.evaluation import Score, comparison, digits, read_comparison, run, score_table, tables
+from sonar_graph import table
+from sonar_graph.evaluation import Score, comparison, digits, read_comparison, run, score_table
 from sonar_graph.report import batch_figures, comparison_page
 from sonar_graph.report.batch_page import render_batch
 from sonar_graph.report.comparison_page import render_report
 from sonar_graph.report.figure_style import ESTIMATOR_COLOURS
+from sonar_graph.states import LandmarkMap
 from tests.recorded_batches import LOGS, drawn_batch, failed, with_failures
 from tests.synthetic import basin_comparison
 
@@ -78,9 +80,31 @@ def test_what_a_log_or_an_estimator_says_is_escaped_everywhere():
 def test_a_notebook_shows_every_score_under_its_run():
     compared = basin_comparison(60)
     text = Page(compared._repr_html_()).text
-    table = score_table(compared)
-    assert all(cell.text in text for row in table.rows for cell in row)
-    assert [column.heading for column in table.columns[2:-1]] == [run.estimator for run in compared.runs]
+    every = score_table(compared)
+    assert all(cell.text in text for row in every.rows for cell in row)
+    assert [column.heading for column in every.columns[2:-1]] == [run.estimator for run in compared.runs]
+
+
+def test_a_notebook_shows_sequences_paths_and_maps_with_their_texts_escaped():
+    """Whole tables, of a part of a large map, and nothing that a name could run."""
+    compared = basin_comparison(60)
+    sequence = replace(compared.sequence, name=HOSTILE)
+    text = Page(sequence._repr_html_()).text
+    assert "<script" not in sequence._repr_html_()
+    assert HOSTILE in text
+    assert all(word in text for word in ("imu 2 0.00", "detections 60", "truth 60", "true landmarks 4"))
+    path = compared.runs[0].causal
+    text = Page(path._repr_html_()).text
+    length_m = np.linalg.norm(np.diff(path.positions, axis=0), axis=1).sum()
+    assert f"length of the path {length_m:.2f} m" in text
+    assert "covariances known" in text
+    assert "covariances unknown" in Page(sequence.truth._repr_html_()).text
+    assert "poses 0" in Page(path.rows(slice(0, 0))._repr_html_()).text
+    landmarks = sequence.true_landmarks
+    assert "Map of 4 landmarks" in (text := Page(landmarks._repr_html_()).text)
+    assert "1 5.000 0.900 -1.000" in text
+    many = LandmarkMap(np.arange(50), np.zeros((50, 3)), np.tile(np.eye(3), (50, 1, 1)))
+    assert "20 more are not shown" in Page(many._repr_html_()).text
 
 
 def drawn(kind: str) -> str:
@@ -130,7 +154,7 @@ def test_a_page_can_be_read_without_seeing_it(page, kind):
     assert all(deeper - level <= 1 for level, deeper in pairwise(levels))
     assert all(attrs.get("scope") for attrs in page.named("th"))
     assert all(len(attrs["aria-label"] or "") > 40 for attrs in page.named("svg"))
-    assert len(page.named("svg")) == {"comparison": 7, "batch": 9}[kind]
+    assert len(page.named("svg")) == {"comparison": 8, "batch": 9}[kind]
     scrolling = [attrs for attrs in page.named("div") if attrs.get("class") == "scroll"]
     assert all(attrs.get("aria-label") and attrs.get("tabindex") == "0" for attrs in scrolling)
 
@@ -155,7 +179,7 @@ def test_text_and_lines_stand_out_from_the_paper(html, scheme):
     for name, least in {"--ink": 7, "--muted": 4.5, "--link": 4.5, "--warning": 4.5}.items():
         assert contrast(colours[name], colours["--paper"]) >= least, name
     runs = [name for name in colours if name.startswith("--run-")]
-    assert len(runs) == len(ESTIMATOR_COLOURS) == tables.RUN_COLOURS
+    assert len(runs) == len(ESTIMATOR_COLOURS) == table.RUN_COLOURS
     assert all(contrast(colours[name], colours["--paper"]) >= 3 for name in runs)
 
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from sonar_graph.evaluation.digits import ABSENT
 from sonar_graph.evaluation.results import MOST_ROWS_NAMED, Comparison, Score
 from sonar_graph.evaluation.scored_instants import published_maps
 from sonar_graph.evaluation.scores import detection_scores, landmark_scores
@@ -20,6 +19,7 @@ from sonar_graph.report.comparison_page import render_report
 from sonar_graph.report.console import published_counterpart, summary
 from sonar_graph.report.landmark_table import landmark_table
 from sonar_graph.states import FIRST_ANONYMOUS_ID, DetectionLog, LandmarkMap, Outcome, Refusal
+from sonar_graph.table import ABSENT
 from tests.synthetic import (
     IDS,
     LANDMARKS,

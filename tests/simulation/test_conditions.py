@@ -76,8 +76,9 @@ MATERIAL = ~np.isnan(FRESH.amplitude)
 FOAM, PLATE = FRESH.amplitude > 1, FRESH.amplitude < 1
 
 
-def test_the_basin_without_conditions_makes_the_images_that_it_always_made():
-    options = BasinOptions.model_validate({"duration_s": 130, "laps": 1, "frame_rate_hz": 1.0, "image": {}})
+def test_flush_landmarks_without_conditions_make_the_images_that_they_always_made():
+    image = {"foam_height_m": 0.0}
+    options = BasinOptions.model_validate({"duration_s": 130, "laps": 1, "frame_rate_hz": 1.0, "image": image})
     imaged = next(islice(simulate_basin_frames(options, 1), 9, None))
     image, truth = imaged.frames.intensity[0].astype(int), imaged.truth
     np.testing.assert_allclose(image[4::10, 100::50], GOLDEN, atol=1)  # one: another processor's rounding
@@ -107,10 +108,11 @@ def test_contrast_changes_bright_parts_and_the_plate_has_a_level_of_its_own():
 
 
 def test_foam_stands_on_its_plate_with_its_face_where_it_was():
-    low, deepest = landmark(foam_height_m=0.012), landmark(foam_height_m=0.1)
-    np.testing.assert_array_equal(low.relief_m[FOAM], FRESH.relief_m[FOAM])
-    np.testing.assert_allclose(low.relief_m[PLATE], FRESH.relief_m[PLATE] - 0.012, atol=1e-6)
-    np.testing.assert_allclose(deepest.relief_m[PLATE], FRESH.relief_m[PLATE] - TRIANGLE.height_m, atol=1e-6)
+    flush, deepest = landmark(foam_height_m=0.0), landmark(foam_height_m=0.1)
+    for one in (FRESH, deepest):
+        np.testing.assert_array_equal(one.relief_m[FOAM], flush.relief_m[FOAM])
+    np.testing.assert_allclose(FRESH.relief_m[PLATE], flush.relief_m[PLATE] - TRIANGLE.relief_m, atol=1e-6)
+    np.testing.assert_allclose(deepest.relief_m[PLATE], flush.relief_m[PLATE] - TRIANGLE.height_m, atol=1e-6)
 
 
 @pytest.mark.parametrize(("name", "share"), [("sediment", 0.25), ("sediment", 1.0), ("fouling", 0.4)])

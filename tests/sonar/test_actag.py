@@ -15,7 +15,7 @@ from sonar_graph.simulation.sonar_image.imaging_sonar import DIDSON, ImageOption
 from sonar_graph.simulation.sonar_image.scene import place_landmark
 from sonar_graph.sonar.actag import AcTagRecogniser, AcTagSettings, evenly_sampled, tag_design
 from sonar_graph.sonar.recogniser import REPORTED
-from sonar_graph.sonar.track_filter import SonarStep
+from sonar_graph.sonar.tracker import SonarStep
 
 FAMILY = "AcTag24h10"
 RANGES_M, AZIMUTHS_RAD = DIDSON.ranges_m(), DIDSON.azimuths_rad()

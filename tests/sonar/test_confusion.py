@@ -28,7 +28,8 @@ ROWS = ((0.8, 0.1, 0.1), (0.2, 0.7, 0.1), (0.5, 0.1, 0.4))
 def model(rows: tuple[tuple[float, ...], ...] = ROWS, designs: Sequence[LandmarkDesign] = ()) -> Confusion:
     return Confusion(
         ids=tuple(range(9, 8 + len(rows))), matrix=rows, designs=tuple(map(mark_of, designs)), weights=tuple(range(9)),
-        looks=2.0, range_sigma_m=0.01, azimuth_sigma_rad=0.002,
+        looks=2.0, range_sigma_m=0.01, across_sigma_m=0.004,
+        range_bound_m=1e-3, across_bound_m=1e-3, bound_power=1.5,
     )  # fmt: skip
 
 
@@ -71,6 +72,7 @@ def test_what_was_never_confused_in_the_shipped_model_is_bounded_by_its_tracks()
         ({"ids": [1, 1]}, "ids: expected each once, not 1, 1"),
         ({"weights": [1.0, 2.0]}, "weights: expected 9, for prior, outline"),
         ({"sharpness": 17.0, "threshold": 0.8}, "an earlier version .* measure it again"),
+        ({"error_correlation": 0.8}, "an earlier version .* measure it again"),
         (None, "not JSON"),
     ],
 )
@@ -106,13 +108,3 @@ def test_designs_that_ship_have_a_measured_model_and_others_an_assumed_one():
     assert other.weights == confusion_for(DEFAULT_DESIGNS).weights
     np.testing.assert_allclose(other.array().sum(axis=1), 1)
     other.check_designs([RING])
-
-
-@pytest.mark.parametrize("rho", [0.0, 0.3, 0.65, 0.9])
-def test_frames_between_reports_tell_together_what_one_independent_frame_tells(rho):
-    """The information of n frames about a constant, 1' C^-1 1, grows by one frame's in each interval."""
-    interval = model().model_copy(update={"error_correlation": rho}).report_interval()
-    lag = np.abs(np.subtract.outer(np.arange(400), np.arange(400)))
-    frames = np.linalg.inv(rho**lag).sum()
-    assert frames == pytest.approx(1 + 399 / ((1 + rho) / (1 - rho)))
-    assert interval - 1 < (1 + rho) / (1 - rho) <= interval + 1e-9

@@ -1,6 +1,7 @@
 """Laws of the whole recogniser, on small images of designs."""
 
 from collections import Counter
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 
@@ -20,7 +21,7 @@ from sonar_graph.sonar.bayes import IdentityParams
 from sonar_graph.sonar.cfar import DetectionParams
 from sonar_graph.sonar.confusion import confusion_for
 from sonar_graph.sonar.recogniser import REPORTED, Recogniser, RecogniserParams, each_once
-from sonar_graph.sonar.track_filter import SonarStep
+from sonar_graph.sonar.tracker import SonarStep
 
 from .polar_images import AZIMUTHS_RAD, RANGES_M, ROTATION, VIEW, image_db, polar
 
@@ -60,7 +61,8 @@ def pass_by(recogniser: Recogniser, design: int | None, frames: int = 9, step_m:
 
 @pytest.mark.parametrize("design", [DISC, SQUARE, TRIANGLE, CROSS])
 def test_a_landmark_passed_by_is_named_and_lies_where_geometry_says(design: int):
-    last = pass_by(Recogniser(DECIBELS, params=EVERY), design)[-1]
+    flush = [replace(one, relief_m=0.0) for one in DEFAULT_DESIGNS]  # as these pictures show them
+    last = pass_by(Recogniser(DECIBELS, flush, EVERY), design)[-1]
     assert last.candidate_ids.tolist() == [[1, 2, 3, 4]]
     ids, probability = last.most_probable()
     assert ids.tolist() == [design + 1]
@@ -244,7 +246,7 @@ def test_no_landmark_is_the_most_probable_identity_of_two_tracks(seed: int, trac
 
 
 def test_a_track_is_reported_as_often_as_its_errors_are_independent_and_when_its_identity_changes():
-    model = confusion_for(DEFAULT_DESIGNS).model_copy(update={"error_correlation": 0.6})  # one frame in four
+    model = confusion_for(DEFAULT_DESIGNS).model_copy(update={"report_interval_s": 0.8})  # one frame in four
     named = {}
     for independent in (True, False):
         recogniser = Recogniser(DECIBELS, params=RecogniserParams(confusion=model, independent=independent))
@@ -261,7 +263,7 @@ def test_a_track_is_reported_as_often_as_its_errors_are_independent_and_when_its
 
 
 def test_a_new_identity_is_reported_at_once(monkeypatch: pytest.MonkeyPatch):
-    model = confusion_for(DEFAULT_DESIGNS).model_copy(update={"error_correlation": 0.9})  # one frame in nineteen
+    model = confusion_for(DEFAULT_DESIGNS).model_copy(update={"report_interval_s": 3.8})
     recogniser, frames = Recogniser(DECIBELS, params=RecogniserParams(confusion=model)), iter(range(15))
     believed = np.eye(5)[[SQUARE] * 8 + [DISC] * 7]
     monkeypatch.setattr(

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
 from sonar_graph.errors import MeasurementError
-from sonar_graph.sonar.track_filter import Expected, SonarStep, TrackStates, corrected
-from sonar_graph.sonar.tracker import Tracker, TrackingParams
+from sonar_graph.sonar.tracker import Expected, SonarStep, Tracker, TrackingParams, TrackStates, corrected
 
 from .polar_images import WINDOW, candidates_at
 

@@ -1,24 +1,30 @@
 """Adapters: message types of any driver read as measurements, each described by field paths and conventions."""
 
 # fmt: off
-from sonar_graph.logs.adapters.adapter import Adapter, leaf_fields
-from sonar_graph.logs.adapters.aiding_messages import HeadingAdapter, PositionAdapter
+from sonar_graph.logs.adapters.adapter import (
+    ANGLES, FORCES, LENGTHS, PRESSURES, RATES, SPEEDS, TIMES, Adapter, axes_matrix, leaf_fields, turned,
+)
+from sonar_graph.logs.adapters.aiding_messages import GeodeticFields, HeadingAdapter, PositionAdapter
 from sonar_graph.logs.adapters.drivers import SHIPPED, TRUTH_WORDS, Z_DOWN_TYPES, Shipped
 from sonar_graph.logs.adapters.dvl_messages import DvlAdapter
 from sonar_graph.logs.adapters.landmark_messages import (
     DetectionArrayAdapter, DetectionListsAdapter, LandmarkMapAdapter, detection_warnings,
 )
+from sonar_graph.logs.adapters.landmark_rows import DetectionRowsAdapter, LandmarkRowsAdapter
 from sonar_graph.logs.adapters.log_config import (
-    LogConfig, changes_text, plain_lines, read_log_config, shipped_for, shipped_like, table_text,
+    ADAPTERS, LogConfig, changes_text, plain_lines, read_log_config, shipped_for, shipped_like, table_text,
 )
-from sonar_graph.logs.adapters.message_table import Dropped, MessageTable, field_of, header_stamps_ns
+from sonar_graph.logs.adapters.message_table import (LARGEST, Dropped, FieldTable, MessageTable, field_of,
+    header_stamps_ns)
 from sonar_graph.logs.adapters.sonar_messages import SAMPLE_TYPES, Refused, SonarAdapter
 from sonar_graph.logs.adapters.vehicle_messages import DepthAdapter, ImuAdapter, TruthAdapter, body_to_ros
 
 __all__ = [
-    "Adapter", "DepthAdapter", "DetectionArrayAdapter", "DetectionListsAdapter", "Dropped", "DvlAdapter",
-    "HeadingAdapter", "ImuAdapter", "LandmarkMapAdapter", "LogConfig", "MessageTable", "PositionAdapter", "Refused",
-    "SAMPLE_TYPES", "SHIPPED", "Shipped", "SonarAdapter", "TRUTH_WORDS", "TruthAdapter", "Z_DOWN_TYPES", "body_to_ros",
-    "changes_text", "detection_warnings", "field_of", "header_stamps_ns", "leaf_fields", "plain_lines",
-    "read_log_config", "shipped_for", "shipped_like", "table_text",
+    "ADAPTERS", "ANGLES", "Adapter", "DepthAdapter", "DetectionArrayAdapter", "DetectionListsAdapter",
+    "DetectionRowsAdapter", "Dropped", "DvlAdapter", "FORCES", "FieldTable", "GeodeticFields", "HeadingAdapter",
+    "ImuAdapter", "LARGEST", "LENGTHS", "LandmarkMapAdapter", "LandmarkRowsAdapter", "LogConfig", "MessageTable",
+    "PRESSURES", "PositionAdapter", "RATES", "Refused", "SAMPLE_TYPES", "SHIPPED", "SPEEDS", "Shipped", "SonarAdapter",
+    "TIMES", "TRUTH_WORDS", "TruthAdapter", "Z_DOWN_TYPES", "axes_matrix", "body_to_ros", "changes_text",
+    "detection_warnings", "field_of", "header_stamps_ns", "leaf_fields", "plain_lines", "read_log_config",
+    "shipped_for", "shipped_like", "table_text", "turned",
 ]

@@ -6,16 +6,16 @@ and conventions. A message type is added without code, as an instance of that su
 `drivers.SHIPPED`, for one log in a table of a TOML file (`log_config`, docs/tutorials/04_your_own_log.md).
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field
 from scipy.spatial.transform import Rotation as SpatialRotation
 
 from sonar_graph.calibration import Section
-from sonar_graph.logs.adapters.message_table import MessageTable, field_of
+from sonar_graph.logs.adapters.message_table import FieldTable, MessageTable, field_of
 from sonar_graph.logs.cdr import Messages, Struct
 from sonar_graph.logs.mcap import Topic
 from sonar_graph.measurements import Floats
@@ -58,8 +58,38 @@ def _not_zero(scale: float) -> float:
     return scale
 
 
+RATES = {"rad/s": 1.0, "deg/s": np.pi / 180, "mrad/s": 1e-3}
+FORCES = {"m/s2": 1.0, "g": 9.80665, "mg": 9.80665e-3, "cm/s2": 1e-2, "mm/s2": 1e-3}
+SPEEDS = {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3, "km/h": 1 / 3.6, "kn": 1852 / 3600}
+LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "ft": 0.3048}
+PRESSURES = {"Pa": 1.0, "hPa": 100.0, "mbar": 100.0, "kPa": 1e3, "dbar": 1e4, "bar": 1e5, "psi": 6894.757293168}
+ANGLES = {"rad": 1.0, "deg": np.pi / 180}
+TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
+"""Units by name, for a scale instead of its number."""
+UNITS = RATES | FORCES | SPEEDS | LENGTHS | PRESSURES | ANGLES | TIMES
+
+
+def _from_units(units: Mapping[str, float]) -> BeforeValidator:
+    """Validator that takes the name of a unit for its factor."""
+
+    def factor(value: object) -> object:
+        if isinstance(value, str) and value not in units:
+            raise ValueError(f"expected a factor or one of the units {', '.join(units)}")
+        return units[value] if isinstance(value, str) else value
+
+    return BeforeValidator(factor)
+
+
 Scale = Annotated[float, Field(allow_inf_nan=False), AfterValidator(_not_zero)]
 """Factor for the numbers of a driver."""
+RateScale = Annotated[Scale, _from_units(RATES)]
+ForceScale = Annotated[Scale, _from_units(FORCES)]
+SpeedScale = Annotated[Scale, _from_units(SPEEDS)]
+LengthScale = Annotated[Scale, _from_units(LENGTHS)]
+DepthScale = Annotated[Scale, _from_units(LENGTHS | PRESSURES)]
+AngleScale = Annotated[Scale, _from_units(ANGLES)]
+TimeUnit = Annotated[float, Field(gt=0, allow_inf_nan=False), _from_units(TIMES)]
+"""A scale, or the name of a unit such as "deg/s"."""
 
 
 class Adapter(Section):
@@ -79,8 +109,8 @@ class Adapter(Section):
     """false: nothing plays this role, whatever the log has."""
     stamp: str = "header.stamp"
     """Field with the time of validity (a Time or a number), or "log": when the message was recorded."""
-    stamp_unit_s: float = Field(1.0, gt=0, allow_inf_nan=False)
-    """Unit of a stamp that is a number; 1e-6 for microseconds."""
+    stamp_unit_s: TimeUnit = 1.0
+    """Unit of a stamp that is a number; 1e-6 or "us" for microseconds."""
     stamp_offset_s: float = Field(0.0, allow_inf_nan=False)
     """Added to every stamp: minus the delay of a driver that stamps when a message arrives."""
     frame_id_field: str | None = "header.frame_id"
@@ -113,7 +143,7 @@ class Adapter(Section):
             return self.frame_id or ""
         return messages[0].first_string(self.frame_id_field)
 
-    def warnings(self, table: MessageTable) -> Iterator[str]:  # noqa: ARG002  # for subclasses
+    def warnings(self, table: FieldTable) -> Iterator[str]:  # noqa: ARG002  # for subclasses
         """Contradictions and unlikely values in messages that can be read."""
         yield from ()
 
@@ -152,7 +182,7 @@ class CovarianceFields(Section):
     zero: Reading = "unknown"
     """Meaning of a covariance of zeros."""
 
-    def read(self, table: MessageTable) -> tuple[Floats, NDArray[np.bool_]]:
+    def read(self, table: FieldTable) -> tuple[Floats, NDArray[np.bool_]]:
         """Covariances, shape (n, 3, 3), NaN: unknown, and a mask of rows that they call invalid, shape (n,)."""
         matrices = self._matrices(table)
         negative = matrices[:, 0, 0] < 0
@@ -163,7 +193,7 @@ class CovarianceFields(Section):
         unknown = negative | zero | ~np.isfinite(matrices).all(axis=(1, 2)) | _is_indefinite(matrices)
         return np.where(unknown[:, None, None], np.nan, matrices), invalid
 
-    def warnings(self, table: MessageTable) -> Iterator[str]:
+    def warnings(self, table: FieldTable) -> Iterator[str]:
         """Number of messages whose matrix is no covariance."""
         if self.meaning == "standard deviation":
             return
@@ -176,13 +206,13 @@ class CovarianceFields(Section):
                 f"variance is negative: the calibration's noise is taken there"
             )
 
-    def read_variance(self, table: MessageTable) -> Floats:
+    def read_variance(self, table: FieldTable) -> Floats:
         """Variances from one field, shape (n,); NaN: unknown (zero, negative, not finite)."""
         value = table.column(self.fields[0]).astype(float)
         known = np.isfinite(value) & (value > 0)
         return np.where(known, value**2 if self.meaning == "standard deviation" else value, np.nan)
 
-    def _matrices(self, table: MessageTable) -> Floats:
+    def _matrices(self, table: FieldTable) -> Floats:
         columns = [table.column(path).astype(float) for path in self.fields]
         if len(columns) > 1:
             stacked = np.stack(columns, axis=-1)

@@ -16,8 +16,15 @@ from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation as SpatialRotation
 
 from sonar_graph.calibration import Section
-from sonar_graph.logs.adapters.adapter import Adapter, CovarianceFields, Scale, axes_matrix, field_paths
-from sonar_graph.logs.adapters.message_table import NOT_FINITE, Dropped, MessageTable, fit_rows, not_finite
+from sonar_graph.logs.adapters.adapter import (
+    Adapter,
+    AngleScale,
+    CovarianceFields,
+    LengthScale,
+    axes_matrix,
+    field_paths,
+)
+from sonar_graph.logs.adapters.message_table import NOT_FINITE, Dropped, FieldTable, fit_rows, not_finite
 from sonar_graph.logs.geodesy import Origin, east_north_up
 from sonar_graph.logs.mcap import Keep, Topic
 from sonar_graph.measurements import FARTHEST_FIX_M, FULL_TURN_RAD, UNMEASURED_M2, Floats, Heading, PositionFixes
@@ -35,8 +42,8 @@ class HeadingAdapter(Adapter):
     """Fields of the quaternion's x, y, z, w: the sensor in the world."""
     yaw: str | None = None
     """Field with an angle instead: of the body, positive to the left from the world's x."""
-    scale: Scale = 1.0
-    """Turns the angle into rad; 0.017453292519943295 from degrees."""
+    scale: AngleScale = 1.0
+    """Turns the angle into rad; 0.017453292519943295 or "deg" from degrees."""
     world: Literal["enu", "ned"] = "enu"
     """"enu" (any world with z up), or "ned": an angle then is a bearing, clockwise from north."""
     yaw_offset_rad: float = Field(0.0, allow_inf_nan=False)
@@ -69,14 +76,14 @@ class HeadingAdapter(Adapter):
             "status = false under [heading] in a log configuration"
         )
 
-    def is_measured(self, table: MessageTable) -> NDArray[np.bool_]:
+    def is_measured(self, table: FieldTable) -> NDArray[np.bool_]:
         """Mask of messages that say that yaw is measured, shape (n,)."""
         measured = np.ones(len(table), bool) if self.status is None else table.column(self.status) != -1
         if self.variance is not None and self.needs_variance:
             measured &= np.isfinite(self.variance.read_variance(table))
         return measured
 
-    def read(self, table: MessageTable, body_R_sensor: Floats) -> tuple[Heading | None, Dropped]:
+    def read(self, table: FieldTable, body_R_sensor: Floats) -> tuple[Heading | None, Dropped]:
         """Yaw of the body with its sigma; NaN: unknown. ``body_R_sensor``, shape (3, 3), counts for an orientation."""
         faults = {"whose orientation is no measurement": ~self.is_measured(table)}
         if self.orientation is not None:
@@ -102,7 +109,7 @@ class HeadingAdapter(Adapter):
         yaw_rad = yaw_rad[rows] + self.yaw_offset_rad if self.yaw_offset_rad else yaw_rad[rows]
         return Heading(table.stamps_ns[rows], yaw_rad, np.sqrt(variance[rows])), dropped
 
-    def warnings(self, table: MessageTable) -> Iterator[str]:
+    def warnings(self, table: FieldTable) -> Iterator[str]:
         """Warnings about a sigma beyond a full turn, and an angle that looks like degrees."""
         if self.variance is not None:
             is_beyond = self.is_measured(table) & (self.variance.read_variance(table) > FULL_TURN_RAD**2)
@@ -128,6 +135,8 @@ class GeodeticFields(Section):
     """Degrees, north."""
     longitude: str
     """Degrees, east."""
+    unit: Literal["deg", "ddmm.mmmm", "rad"] = "deg"
+    """Of both: "ddmm.mmmm" for degrees and minutes written as one number, as receivers do (NMEA)."""
     height: str | None = None
     """Metres above the ellipsoid, or any other level; none, or not finite: not measured."""
     status: str | None = None
@@ -139,19 +148,31 @@ class GeodeticFields(Section):
         """Paths that a message must have."""
         return field_paths(self.latitude, self.longitude, self.height, self.status)
 
-    def read(self, table: MessageTable) -> tuple[Floats, NDArray[np.bool_]]:
+    def read(self, table: FieldTable) -> tuple[Floats, NDArray[np.bool_]]:
         """Latitude, longitude in degrees and height in metres, shape (n, 3), and a mask of fixes, shape (n,).
 
         Drivers without a fix send latitude and longitude 0; a height that is not measured is NaN.
         """
         place = np.column_stack([table.column(self.latitude), table.column(self.longitude)]).astype(float)
+        if self.unit == "ddmm.mmmm":
+            degrees = np.trunc(place / 100)
+            place = degrees + (place - 100 * degrees) / 60
+        elif self.unit == "rad":
+            place = np.degrees(place)
         height = table.column(self.height).astype(float) if self.height else np.full(len(table), np.nan)
         is_fix = np.isfinite(place).all(axis=1) & place.any(axis=1) & (np.abs(place) <= [90.0, 360.0]).all(axis=1)
         if self.status is not None:
             is_fix &= table.column(self.status) >= 0
         return np.column_stack([place, np.where(np.isfinite(height), height, np.nan)]), is_fix
 
-    def first_fix(self, table: MessageTable) -> Origin | None:
+    def beyond(self, table: FieldTable) -> str:
+        """Remark about latitudes that are none, for rows without a fix; empty where there are few."""
+        latitude = np.abs(table.column(self.latitude).astype(float))
+        if self.unit != "deg" or not np.median(latitude) > 90.0:
+            return ""
+        return f' ({self.latitude} is up to {np.nanmax(latitude):.6g}: unit = "ddmm.mmmm" inside geodetic?)'
+
+    def first_fix(self, table: FieldTable) -> Origin | None:
         """Latitude and longitude in degrees, and height in metres, of the first fix by its stamp; None without one."""
         places, is_fix = self.read(table)
         rows = np.flatnonzero(is_fix)
@@ -161,7 +182,7 @@ class GeodeticFields(Section):
         heights = places[is_fix & np.isfinite(places[:, 2]), 2]
         return latitude, longitude, height if np.isfinite(height) else float(heights[0]) if heights.size else 0.0
 
-    def positions(self, table: MessageTable, origin: Origin | None) -> tuple[Floats, np.ndarray, NDArray[np.bool_]]:
+    def positions(self, table: FieldTable, origin: Origin | None) -> tuple[Floats, np.ndarray, NDArray[np.bool_]]:
         """Metres east, north, up of an origin in degrees and metres, shape (n, 3), and masks of fixes and of heights.
 
         A height that is not measured is 0.
@@ -183,8 +204,8 @@ class PositionAdapter(Adapter):
     """Fields of a position on the Earth."""
     position: tuple[str, str, str] | None = None
     """Fields of x, y, z in the world instead, metres."""
-    scale: Scale = 1.0
-    """Turns `position` into metres, and its covariance by the square; 0.001 from millimetres."""
+    scale: LengthScale = 1.0
+    """Turns `position` into metres, and its covariance by the square; 0.001 or "mm" from millimetres."""
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """World's origin in the scaled coordinates of `position`, such as that of a run in a map grid (UTM)."""
     world: Literal["enu", "ned"] = "enu"
@@ -207,7 +228,7 @@ class PositionAdapter(Adapter):
         return field_paths(geodetic, self.position, covariance, self.covariance_type)
 
     def read(
-        self, table: MessageTable, origin: Origin | None, sigma_m: tuple[float, float, float]
+        self, table: FieldTable, origin: Origin | None, sigma_m: tuple[float, float, float]
     ) -> tuple[PositionFixes | None, Dropped]:
         """Fixes with covariances, NaN: unknown.
 
@@ -218,7 +239,7 @@ class PositionAdapter(Adapter):
         has_height = np.ones(len(table), bool)
         if self.geodetic is not None:
             positions, is_fix, has_height = self.geodetic.positions(table, origin)
-            faults["without a fix"] = ~is_fix
+            faults[f"without a fix{self.geodetic.beyond(table)}"] = ~is_fix
         else:
             positions = table.beside(self.position or ()).astype(float) * self.scale - self.origin_m
             faults[NOT_FINITE] = not_finite(positions)
@@ -238,7 +259,7 @@ class PositionAdapter(Adapter):
         fixes = PositionFixes(table.stamps_ns[rows], positions[rows], covariances[rows]) if rows.size else None
         return fixes, dropped
 
-    def warnings(self, table: MessageTable) -> Iterator[str]:
+    def warnings(self, table: FieldTable) -> Iterator[str]:
         """Warnings about matrices that are no covariances, and places that are not on the Earth."""
         if self.covariance is not None:
             yield from self.covariance.warnings(table)

@@ -18,8 +18,8 @@ from pydantic import Field, model_validator
 
 from sonar_graph.calibration import Section
 from sonar_graph.devices import velocity_of_beams
-from sonar_graph.logs.adapters.adapter import Adapter, CovarianceFields, Scale, field_paths, turn, turn_covariances
-from sonar_graph.logs.adapters.message_table import NOT_FINITE, Dropped, MessageTable, fit_rows, not_finite
+from sonar_graph.logs.adapters.adapter import Adapter, CovarianceFields, SpeedScale, field_paths, turn, turn_covariances
+from sonar_graph.logs.adapters.message_table import NOT_FINITE, Dropped, FieldTable, fit_rows, not_finite
 from sonar_graph.measurements import Dvl, Floats
 
 LARGEST_TILT_DEG = 45.0
@@ -52,7 +52,7 @@ class BeamGeometry(Section):
         across, down = np.sin(tilt), np.full(azimuth.shape, np.cos(tilt))
         return np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), down])
 
-    def velocities(self, table: MessageTable, scale: float) -> tuple[Floats, Floats, NDArray[np.int64]]:
+    def velocities(self, table: FieldTable, scale: float) -> tuple[Floats, Floats, NDArray[np.int64]]:
         """Velocities from the valid beams of each row, along the driver's axes; ``scale`` turns the field into m/s.
 
         Shape (n, 3), NaN with too few beams; their covariances, shape (n, 3, 3), NaN without `sigma_m_s`; and the
@@ -127,8 +127,8 @@ class DvlAdapter(Adapter):
 
     velocity: tuple[str, str, str] | None = None
     """Fields of the velocity along x, y, z; not used where `beams` have a velocity."""
-    scale: Scale = 1.0
-    """Turns it into m/s; 0.001 from mm/s, -1 where the driver gives the bottom's velocity."""
+    scale: SpeedScale = 1.0
+    """Turns it into m/s; 0.001 or "mm/s" from mm/s, -1 where the driver gives the bottom's velocity."""
     covariance: CovarianceFields | None = None
     """Of the velocity, before `scale`; without it the calibration's noise holds."""
     valid_where: Mapping[str, Number] = {}
@@ -162,7 +162,7 @@ class DvlAdapter(Adapter):
         covariance = self.covariance.fields if self.covariance else None
         return field_paths(self.velocity, covariance, self.valid_where, self.good_beams, *checked, *beams)
 
-    def read(self, table: MessageTable) -> tuple[Dvl | None, Dropped]:
+    def read(self, table: FieldTable) -> tuple[Dvl | None, Dropped]:
         """The rows with a valid velocity, or with part of one from beams; a covariance that is not known is NaN."""
         faults: dict[str, NDArray[np.bool_]] = {}
         if self.beams is not None and self.beams.velocity is not None:
@@ -192,7 +192,7 @@ class DvlAdapter(Adapter):
         """Tell whether the covariance follows from the beams, not from a field of the message."""
         return self.beams is not None and self.beams.velocity is not None and self.beams.sigma_m_s is not None
 
-    def warnings(self, table: MessageTable) -> Iterator[str]:
+    def warnings(self, table: FieldTable) -> Iterator[str]:
         """Warnings about covariances, beam directions, ranges and the speed of sound that a driver gets wrong."""
         if self.covariance is not None and not self._is_noise_of_beams:
             yield from self.covariance.warnings(table)
@@ -200,7 +200,7 @@ class DvlAdapter(Adapter):
             vectors = np.stack([table.column(path)[0] for path in self.beam_unit_vectors], axis=-1)
             if fault := beam_direction_fault(vectors, self.beams):
                 field = self.beam_unit_vectors[0].rpartition(".")[0]
-                yield f"topic {table.topic.name}: {field}: beam directions {fault}; they are not used"
+                yield f"{table.source}: {field}: beam directions {fault}; they are not used"
         if self.sound_speed is not None and not table.column(self.sound_speed).any():
             yield f"{self.sound_speed} is 0 in every message: the driver does not fill it"
         if self.beam_ranges is not None and self.beam_ranges_valid is not None:

@@ -11,9 +11,8 @@ the shipped adapter has (docs/tutorials/04_your_own_log.md)::
 
 from __future__ import annotations
 
-import json
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
@@ -23,7 +22,7 @@ from pydantic import BaseModel, ValidationError
 
 from sonar_graph.errors import LogError
 from sonar_graph.files import text_of
-from sonar_graph.logs.adapters.adapter import Adapter, leaf_fields
+from sonar_graph.logs.adapters.adapter import UNITS, Adapter, leaf_fields
 from sonar_graph.logs.adapters.aiding_messages import HeadingAdapter, PositionAdapter
 from sonar_graph.logs.adapters.drivers import SHIPPED
 from sonar_graph.logs.adapters.dvl_messages import DvlAdapter
@@ -32,7 +31,7 @@ from sonar_graph.logs.adapters.message_table import LOG_TIME, field_of
 from sonar_graph.logs.adapters.sonar_messages import SonarAdapter
 from sonar_graph.logs.adapters.vehicle_messages import DepthAdapter, ImuAdapter, TruthAdapter
 from sonar_graph.logs.cdr import Struct, short_name
-from sonar_graph.settings import faults_in
+from sonar_graph.settings import faults_in, meanings_of, toml_key, toml_value
 
 ADAPTERS: dict[str, type[Adapter]] = {
     "imu": ImuAdapter,
@@ -91,6 +90,11 @@ class LogConfig:
     def table(self, role: str) -> Table:
         """Table of a role; empty where there is none."""
         return self.tables.get(role, {})
+
+    def number(self, role: str, key: str, default: float) -> float:
+        """A number in a role's table, also where it is written as a unit."""
+        value = self.table(role).get(key, default)
+        return UNITS[value] if isinstance(value, str) else float(value)
 
     def types(self) -> frozenset[str]:
         """Message types that tables name, without the ``msg``."""
@@ -190,12 +194,13 @@ def table_text(role: str, topic: str, adapter: Adapter, shipped: Adapter | None)
     A setting that is None is written only where the shipped adapter for the type has one.
     """
     lines = [f"[{role}]", _line("topic", topic, None), _line("type", adapter.type, None)]
-    for name, info in type(adapter).model_fields.items():
+    meanings = meanings_of(type(adapter))
+    for name in type(adapter).model_fields:
         value = getattr(adapter, name)
         if name in ("topic", "type", "use"):
             continue
         if value is not None:
-            lines.append(_line(name, value, info.description))
+            lines.append(_line(name, value, meanings.get(name)))
         elif shipped is not None and getattr(shipped, name, None) is not None:
             lines.append(f"{name} = false")
     return "\n".join(lines)
@@ -211,7 +216,7 @@ def changes_text(adapter: Adapter, shipped: Adapter | None) -> str:
 
 def plain_lines(table: Mapping[str, Any]) -> list[str]:
     """Lines of a table, one for each key."""
-    return [f"{_key(name)} = {toml_value(value)}" for name, value in table.items()]
+    return [f"{toml_key(name)} = {toml_value(value)}" for name, value in table.items()]
 
 
 def _line(name: str, value: Any, description: str | None) -> str:
@@ -219,29 +224,3 @@ def _line(name: str, value: Any, description: str | None) -> str:
     meaning = " ".join((description or "").split()).partition(". ")[0].rstrip(".")
     with_meaning = f"{line}  # {meaning}"
     return with_meaning if meaning and len(with_meaning) <= _WIDTH else line
-
-
-def toml_value(value: Any) -> str:
-    """A value as TOML, on one line."""
-    if isinstance(value, BaseModel):
-        return toml_value(value.model_dump(exclude_none=True))
-    if isinstance(value, str):
-        return _text(value)
-    if isinstance(value, bool):
-        return json.dumps(value)
-    if isinstance(value, int | float):
-        return repr(value)
-    if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{_key(key)} = {toml_value(item)}" for key, item in value.items()) + "}"
-    if isinstance(value, Sequence):
-        return "[" + ", ".join(map(toml_value, value)) + "]"
-    raise TypeError(f"{type(value).__name__} has no TOML form")
-
-
-def _key(name: str) -> str:
-    return name if name.replace("_", "").replace("-", "").isalnum() and name.isascii() else _text(name)
-
-
-def _text(value: str) -> str:
-    """A basic string: that of JSON, but for one character that TOML does not allow."""
-    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

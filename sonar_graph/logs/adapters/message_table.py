@@ -1,5 +1,6 @@
 """Messages of a topic as one table: columns over all rows, stamps, and the rows that are fit for use."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any, NoReturn
 
@@ -25,7 +26,35 @@ def header_stamps_ns(group: Messages, log_times_ns: Ints, prefix: str = "header.
     return np.where(stamps_ns == 0, log_times_ns[group.rows], stamps_ns)
 
 
-class MessageTable:
+class FieldTable(ABC):
+    """Rows with a stamp each, whose fields are columns: messages of a topic, or lines of a text file."""
+
+    stamps_ns: Ints
+    """Shape (n,)."""
+    source: str
+    """Name for sentences, such as "topic /dvl"."""
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    @abstractmethod
+    def column(self, path: str) -> NDArray[Any]:
+        """A field over all rows, shape (n,) or (n, m); ``a.b[2]`` is one element of an array, shape (n,)."""
+
+    @abstractmethod
+    def refuse(self, path: str, fault: str) -> NoReturn:
+        """Raise a `LogError` about a field."""
+
+    def beside(self, paths: Sequence[str]) -> NDArray[Any]:
+        """Fields with one number a row side by side, shape (n, m)."""
+        found = [self.column(path) for path in paths]
+        for path, column in zip(paths, found, strict=True):
+            if column.ndim > 1:
+                self.refuse(path, f"is an array of {column.shape[1]}; name one element, such as {path}[0]")
+        return np.column_stack(found)
+
+
+class MessageTable(FieldTable):
     """All messages of a topic whose fields of interest have the same size in each, stamped as an `Adapter` says.
 
     A LogError names file, topic and field where the messages are not what their definition says.
@@ -34,7 +63,7 @@ class MessageTable:
     def __init__(
         self, topic: Topic, stamp: str = "header.stamp", stamp_unit_s: float = 1.0, stamp_offset_s: float = 0.0
     ) -> None:
-        self.topic = topic
+        self.topic, self.source = topic, f"topic {topic.name}"
         self.groups = topic.messages()
         if not self.groups:
             faults = ", ".join(f"{count} {fault}" for fault, count in topic.unsound.items())
@@ -51,9 +80,6 @@ class MessageTable:
                 self.stamps_ns[group.rows] = header_stamps_ns(group, log_times_ns, f"{stamp}.")
         if stamp_offset_s:
             self.stamps_ns = self.stamps_ns + round(stamp_offset_s * NS_PER_S)
-
-    def __len__(self) -> int:
-        return len(self.stamps_ns)
 
     def has(self, path: str) -> bool:
         """Tell whether every message has a field with values."""
@@ -74,14 +100,6 @@ class MessageTable:
         if values.ndim == 1 or index >= values.shape[1]:
             self.refuse(path, f"has {values.shape[1] if values.ndim > 1 else 'no'} elements")
         return values[:, index]
-
-    def beside(self, paths: Sequence[str]) -> NDArray[Any]:
-        """Fields with one number a message side by side, shape (n, m)."""
-        found = [self.column(path) for path in paths]
-        for path, column in zip(paths, found, strict=True):
-            if column.ndim > 1:
-                self.refuse(path, f"is an array of {column.shape[1]}; name one element, such as {path}[0]")
-        return np.column_stack(found)
 
     def refuse(self, path: str, fault: str) -> NoReturn:
         """Raise a `LogError` about a field."""

@@ -17,9 +17,20 @@ import numpy as np
 from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation as SpatialRotation
 
-from sonar_graph.logs.adapters.adapter import Adapter, CovarianceFields, Scale, axes_matrix, field_paths, turn
+from sonar_graph.logs.adapters.adapter import (
+    Adapter,
+    AngleScale,
+    CovarianceFields,
+    DepthScale,
+    ForceScale,
+    LengthScale,
+    RateScale,
+    axes_matrix,
+    field_paths,
+    turn,
+)
 from sonar_graph.logs.adapters.aiding_messages import ENU_R_NED, GeodeticFields
-from sonar_graph.logs.adapters.message_table import LARGEST, NOT_FINITE, Dropped, MessageTable, fit_rows, not_finite
+from sonar_graph.logs.adapters.message_table import LARGEST, NOT_FINITE, Dropped, FieldTable, fit_rows, not_finite
 from sonar_graph.logs.geodesy import Origin
 from sonar_graph.measurements import Depth, Floats, Imu
 from sonar_graph.states import Trajectory
@@ -34,14 +45,14 @@ class ImuAdapter(Adapter):
 
     angular_velocity: Paths
     """Fields of the rates about x, y, z."""
-    angular_velocity_scale: Scale = 1.0
-    """Turns them into rad/s; 0.017453292519943295 from degrees."""
+    angular_velocity_scale: RateScale = 1.0
+    """Turns them into rad/s; 0.017453292519943295 or "deg/s" from degrees."""
     angular_velocity_status: str | None = None
     """Field that is -1 where the rate was not measured."""
     linear_acceleration: Paths
     """Fields of the specific force along x, y, z, which accelerometers measure: +9.81 upwards at rest."""
-    linear_acceleration_scale: Scale = 1.0
-    """Turns them into m/s²; 9.80665 from g, -1 where the driver gives gravity's own direction."""
+    linear_acceleration_scale: ForceScale = 1.0
+    """Turns them into m/s²; 9.80665 or "g" from g, -1 where the driver gives gravity's own direction."""
     linear_acceleration_status: str | None = None
     """Field that is -1 where it was not measured."""
     are_zeros_measured: bool = False
@@ -54,7 +65,7 @@ class ImuAdapter(Adapter):
         status = (self.angular_velocity_status, self.linear_acceleration_status)
         return field_paths(self.angular_velocity, self.linear_acceleration, *status)
 
-    def read(self, table: MessageTable) -> tuple[Imu | None, Dropped]:
+    def read(self, table: FieldTable) -> tuple[Imu | None, Dropped]:
         """The rows with an angular rate; specific force is NaN where it was not measured."""
         rate = _scaled(table.beside(self.angular_velocity), self.angular_velocity_scale)
         force = _scaled(table.beside(self.linear_acceleration), self.linear_acceleration_scale)
@@ -67,7 +78,7 @@ class ImuAdapter(Adapter):
         rate, force = turn(self.rotation, rate[rows]), turn(self.rotation, force[rows])
         return (Imu(table.stamps_ns[rows], rate, force) if rows.size else None), dropped
 
-    def warnings(self, table: MessageTable) -> Iterator[str]:
+    def warnings(self, table: FieldTable) -> Iterator[str]:
         """Warning about a specific force that the driver does not fill, or fills with what is no number."""
         names, bad = ", ".join(self.linear_acceleration), not_finite(table.beside(self.linear_acceleration))
         if self._is_force_unfilled(table):
@@ -75,7 +86,7 @@ class ImuAdapter(Adapter):
         elif bad.any() and not bad.all():
             yield f"{names} are not finite in {bad.sum()} of {len(table)} messages: taken as not measured there"
 
-    def _is_force_unfilled(self, table: MessageTable) -> bool:
+    def _is_force_unfilled(self, table: FieldTable) -> bool:
         """Tell whether the force is zero in all messages, which not even free fall gives."""
         if self.are_zeros_measured:
             return False
@@ -87,7 +98,7 @@ def _scaled(values: np.ndarray, scale: float) -> np.ndarray:
     return values if scale == 1 else values * scale
 
 
-def _is_marked(table: MessageTable, path: str | None) -> np.ndarray:
+def _is_marked(table: FieldTable, path: str | None) -> np.ndarray:
     return np.zeros(len(table), bool) if path is None else table.column(path) == -1
 
 
@@ -98,8 +109,8 @@ class DepthAdapter(Adapter):
     """Field with a pressure."""
     height: str | None = None
     """Field with a height, instead: metres, upwards; with scale = -1 a depth, downwards."""
-    scale: Scale = 1.0
-    """Turns the field into Pa or into metres upwards; 100 from hPa and mbar."""
+    scale: DepthScale = 1.0
+    """Turns the field into Pa or into metres upwards; 100 or "hPa" from hPa and mbar."""
     atmosphere_pa: float = Field(101_325.0, ge=0)
     """Pressure at the surface; 0 where the driver gives the pressure above it."""
     water_density_kg_m3: float = Field(1000.0, gt=0)
@@ -117,7 +128,7 @@ class DepthAdapter(Adapter):
         """Paths that a message must have."""
         return field_paths(self.pressure, self.height, self.variance.fields if self.variance else None)
 
-    def read(self, table: MessageTable, gravity_m_s2: float) -> tuple[Depth | None, Dropped]:
+    def read(self, table: FieldTable, gravity_m_s2: float) -> tuple[Depth | None, Dropped]:
         """Heights with variances; NaN: unknown."""
         variance_m2 = self.variance.read_variance(table) if self.variance else np.full(len(table), np.nan)
         if self.scale != 1:
@@ -139,7 +150,7 @@ class DepthAdapter(Adapter):
         fresh = ", fresh water assumed" if self.water_density_kg_m3 == 1000 else ""
         return f"z = -(p - {self.atmosphere_pa:g} Pa) / ({water}){fresh}"
 
-    def warnings(self, table: MessageTable) -> Iterator[str]:
+    def warnings(self, table: FieldTable) -> Iterator[str]:
         """Warning about a pressure below the atmosphere's."""
         if self.pressure is None:
             return
@@ -160,10 +171,16 @@ class TruthAdapter(Adapter):
     frame_id_field: str | None = None
     position: Paths | None = None
     """Fields of x, y, z in the world."""
+    scale: LengthScale = 1.0
+    """Turns them into metres; 0.001 or "mm" from millimetres."""
     geodetic: GeodeticFields | None = None
     """Fields of a position on the Earth instead."""
     orientation: tuple[str, str, str, str] | None = None
     """Fields of the quaternion's x, y, z, w; false: only positions are true, and no heading is scored."""
+    rpy: Paths | None = None
+    """Fields of roll, pitch, yaw instead: world_R_body = Rz(yaw) Ry(pitch) Rx(roll), along the driver's axes."""
+    rpy_scale: AngleScale = 1.0
+    """Turns them into rad; 0.017453292519943295 or "deg" from degrees."""
     covariance: str | None = None
     """Array field of 36: position, then rotation, along the world's axes, as ROS has it."""
     covariance_meaning: Literal["variance", "standard deviation"] = "variance"
@@ -175,27 +192,29 @@ class TruthAdapter(Adapter):
     def _has_one_source(self) -> TruthAdapter:
         if (self.geodetic is None) == (self.position is None):
             raise ValueError("give either position = [x, y, z] or geodetic = {latitude = ..., longitude = ...}")
+        if self.orientation is not None and self.rpy is not None:
+            raise ValueError("give either orientation = [x, y, z, w] or rpy = [roll, pitch, yaw]")
         return self
 
     def fields(self) -> Iterator[str]:
         """Paths that a message must have."""
         geodetic = self.geodetic.paths() if self.geodetic else None
-        return field_paths(self.position, geodetic, self.orientation, self.covariance)
+        return field_paths(self.position, geodetic, self.orientation, self.rpy, self.covariance)
 
-    def read(self, table: MessageTable, origin: Origin | None = None) -> tuple[Trajectory | None, Dropped]:
+    def read(self, table: FieldTable, origin: Origin | None = None) -> tuple[Trajectory | None, Dropped]:
         """Poses with covariances, NaN: unknown; ``origin`` in degrees and metres, of positions on the Earth."""
         faults: dict[str, np.ndarray] = {}
         if self.geodetic is not None:
             positions, is_fix, _ = self.geodetic.positions(table, origin)
-            faults["without a fix"] = ~is_fix
+            faults[f"without a fix{self.geodetic.beyond(table)}"] = ~is_fix
         else:
-            positions = table.beside(self.position or ())
+            positions = _scaled(table.beside(self.position or ()), self.scale)
             faults[NOT_FINITE] = not_finite(positions)
-        if self.orientation is None:
+        if self.orientation is None and self.rpy is None:
             rows, dropped = fit_rows(table.stamps_ns, faults, unique=True)
             positions = positions[rows] @ ENU_R_NED.T if self.world == "ned" and self.position else positions[rows]
             return Trajectory.of_positions(table.stamps_ns[rows], positions) if rows.size else None, dropped
-        quaternions = table.beside(self.orientation)
+        quaternions = self._quaternions(table)
         lengths = np.linalg.norm(quaternions, axis=1)
         faults[NOT_FINITE] = not_finite(positions, quaternions)
         faults["without an orientation"] = lengths < 0.5
@@ -224,11 +243,20 @@ class TruthAdapter(Adapter):
         covariances = ros_to_body(covariances, truth.matrices)
         return Trajectory(truth.stamps_ns, truth.positions, truth.quaternions_xyzw, covariances), dropped
 
-    def warnings(self, table: MessageTable) -> Iterator[str]:
+    def _quaternions(self, table: FieldTable) -> np.ndarray:
+        """Orientations x, y, z, w, shape (n, 4); zeros where an angle is not finite."""
+        if self.rpy is None:
+            return table.beside(self.orientation or ())
+        angles = table.beside(self.rpy) * self.rpy_scale
+        is_finite = np.asarray(np.isfinite(angles).all(axis=1))
+        found = SpatialRotation.from_euler("xyz", np.where(is_finite[:, None], angles, 0.0)).as_quat()
+        return np.where(is_finite[:, None], found, 0.0)
+
+    def warnings(self, table: FieldTable) -> Iterator[str]:
         """Warning about an orientation that never changes while the vehicle moves."""
-        if self.orientation is None or self.position is None or len(table) < 2:
+        if (self.orientation is None and self.rpy is None) or self.position is None or len(table) < 2:
             return
-        quaternions, positions = table.beside(self.orientation), table.beside(self.position)
+        quaternions, positions = self._quaternions(table), _scaled(table.beside(self.position), self.scale)
         moved_m = float(np.linalg.norm(np.ptp(positions, axis=0)))
         if np.isfinite(moved_m) and moved_m > LEAST_MOVE_M and not (quaternions != quaternions[0]).any():
             yield (

@@ -19,7 +19,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import cache, cached_property, lru_cache
 from struct import Struct as Packing
 from typing import Any, NamedTuple
 
@@ -281,9 +281,16 @@ class Layout:
         self.words = walk.words
         self.plan = plan
         self._found = walk.found
+        self._places: dict[str, PayloadColumn] = {}
 
     def column(self, path: str) -> PayloadColumn:
         """Places of the values of a field; a KeyError where the type has no such field with values of its own."""
+        place = self._places.get(path)
+        if place is None:
+            place = self._places[path] = self._place(path)
+        return place
+
+    def _place(self, path: str) -> PayloadColumn:
         step, dtypes, is_single = self.columns[path]
         found = self._found[step.index]
         if isinstance(step, FieldBlock):
@@ -299,12 +306,17 @@ class Layout:
 
     def same(self, payloads: Bytes, rows: Ints) -> NDArray[np.bool_]:
         """True for each of some rows of payloads, shape (n, size), that has this layout."""
+        places, expected = self._distinction
+        some = payloads[:, places] if len(rows) == len(payloads) else payloads[np.ix_(rows, places)]
+        return np.asarray((some == expected).all(axis=1))
+
+    @cached_property
+    def _distinction(self) -> tuple[Ints, Bytes]:
+        """Places and values of the bytes of the encapsulation and of all length words."""
         words = np.array(self.words, np.int64).reshape(-1, 2)
         places = np.concatenate([[0, 1], (words[:, :1] + np.arange(LENGTH_BYTES)).reshape(-1)])
         lengths = words[:, 1].astype(f"{self.byte_order}u{LENGTH_BYTES}").view(np.uint8)
-        expected = np.concatenate([np.frombuffer(ENCAPSULATIONS[self.byte_order], np.uint8), lengths])
-        some = payloads[:, places] if len(rows) == len(payloads) else payloads[np.ix_(rows, places)]
-        return np.asarray((some == expected).all(axis=1))
+        return places, np.concatenate([np.frombuffer(ENCAPSULATIONS[self.byte_order], np.uint8), lengths])
 
 
 MOST_PADDING = 3

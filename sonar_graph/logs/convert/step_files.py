@@ -125,6 +125,15 @@ def read_victoria_park(path: Path | None = None) -> Sequence:
     ------
     DatasetError
         When the file is missing or malformed, or its odometry is no single chain.
+
+    Examples
+    --------
+    The file comes with gtsam:
+
+    >>> from sonar_graph.logs.convert import read_victoria_park
+    >>> sequence = read_victoria_park()
+    >>> round(sequence.duration_s), len(sequence.detections)
+    (6968, 3640)
     """
     path = path or Path(gtsam.findExampleDataFile("victoria_park.txt"))  # type: ignore[no-untyped-call]
     steps: list[list[float]] = []

@@ -1,18 +1,20 @@
 """MCAP containers: messages read by topic, also from damaged files, and written with CRCs."""
 
 # fmt: off
+from sonar_graph.logs.mcap.bag_folder import log_parts
 from sonar_graph.logs.mcap.file_summary import Instant, TimeWindow, parse
-from sonar_graph.logs.mcap.reader import ChunkPart, Passage, Progress, Recording, scan, stream
+from sonar_graph.logs.mcap.reader import ChunkPart, Passage, Progress, Recording
 from sonar_graph.logs.mcap.records import LARGEST_BYTES, LARGEST_RATIO, START_BYTES, LogFile, seal, why_no_bag
-from sonar_graph.logs.mcap.topic import STAMP_BYTES, Keep, Topic
+from sonar_graph.logs.mcap.scanning import scan, stream
+from sonar_graph.logs.mcap.topic import STAMP_BYTES, Damage, Keep, Topic
 from sonar_graph.logs.mcap.writer import (
     LIBRARY, ROSBAG2_METADATA, TRANSIENT_LOCAL, Attachment, Outgoing, RecordingWriter, is_own_log, recording,
     write_recording,
 )
 
 __all__ = [
-    "Attachment", "ChunkPart", "Instant", "Keep", "LARGEST_BYTES", "LARGEST_RATIO", "LIBRARY", "LogFile", "Outgoing",
-    "Passage", "Progress", "ROSBAG2_METADATA", "Recording", "RecordingWriter", "STAMP_BYTES", "START_BYTES",
-    "TRANSIENT_LOCAL", "TimeWindow", "Topic", "is_own_log", "parse", "recording", "scan", "seal", "stream",
+    "Attachment", "ChunkPart", "Damage", "Instant", "Keep", "LARGEST_BYTES", "LARGEST_RATIO", "LIBRARY", "LogFile",
+    "Outgoing", "Passage", "Progress", "ROSBAG2_METADATA", "Recording", "RecordingWriter", "STAMP_BYTES", "START_BYTES",
+    "TRANSIENT_LOCAL", "TimeWindow", "Topic", "is_own_log", "log_parts", "parse", "recording", "scan", "seal", "stream",
     "why_no_bag", "write_recording",
 ]

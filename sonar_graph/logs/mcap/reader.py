@@ -28,8 +28,6 @@ from sonar_graph.logs.mcap.chunks import (
 )
 from sonar_graph.logs.mcap.file_summary import TimeWindow, first_time_ns, parse, read_summary
 from sonar_graph.logs.mcap.records import (
-    LARGEST_BYTES,
-    LARGEST_RATIO,
     PRIVATE,
     ByteRange,
     ChunkRecord,
@@ -39,7 +37,7 @@ from sonar_graph.logs.mcap.records import (
     RecordWalk,
     open_seal,
 )
-from sonar_graph.logs.mcap.topic import Damage, Descriptions, Keep, Loss, Topic, settle
+from sonar_graph.logs.mcap.topic import Damage, Descriptions, Keep, Loss, Topic
 
 _BLOCK = 1 << 22
 _NS_PER_S = 1_000_000_000
@@ -370,95 +368,3 @@ class Recording:
             more = f" (and {len(self.corrupt) - 1} more)" if len(self.corrupt) > 1 else ""
             advice = "copy it again, or read what is whole with --salvage"
             raise LogError(f"{self.path} is damaged: {self.corrupt[0]}{more}; {advice}")
-
-
-def scan(
-    path: Path, keep: Callable[[str], Keep], window: TimeWindow | None = None, progress: Progress | None = None
-) -> Recording:
-    """Read an MCAP file in one pass.
-
-    Parameters
-    ----------
-    path
-        The file.
-    keep
-        Part of the messages to keep, by the name of their type.
-    window
-        Wanted time of recording; latched topics such as ``/tf_static`` are read whenever recorded.
-    progress
-        Called with the bytes done and the bytes in all.
-
-    Raises
-    ------
-    LogError
-        When the file does not exist, is not MCAP, or nothing in it was recorded in the window.
-    """
-    with LogFile(path) as file:
-        passage = Passage(file, keep, window, progress=progress)
-        try:
-            _gather_all(passage, file)
-        except IndexMismatchError:
-            remarks = passage.damage.remarks
-            passage = Passage(file, keep, window, may_skip=False, progress=progress)
-            _gather_all(passage, file)
-            passage.damage.remarks[:0] = remarks
-    counts = passage.counts
-    topics = {
-        name: topic
-        for name, topic in sorted(passage.topics.items())
-        if len(topic) or (topic.keep is Keep.NONE and (counts or {}).get(name))  # those of skipped chunks
-    }
-    is_complete = not passage.skipped and passage.part is None  # every message that can be read was counted
-    settle(passage.damage, topics, counts if is_complete else None)
-    if passage.part and not any(len(topic) and not topic.is_latched for topic in topics.values()):
-        raise LogError(f"{path}: nothing was recorded from {passage.part}")
-    return Recording(
-        path,
-        topics,
-        passage.metadata,
-        passage.damage,
-        min((int(topic.log_times_ns.min()) for topic in topics.values() if topic.times), default=None),
-        passage.chunks,
-        passage.skipped,
-        passage.part,
-    )
-
-
-def _gather_all(passage: Passage, file: LogFile) -> None:
-    """Gather the wanted messages by topic; a LogError where they are more than a log of this size can honestly hold."""
-    held, most = 0, max(LARGEST_BYTES, file.size * LARGEST_RATIO)
-    for piece in passage:
-        before = piece.topic.held_bytes
-        piece.topic.gather(piece.data, *piece.found)
-        held += piece.topic.held_bytes - before
-        if held > most:
-            raise LogError(
-                f"{file.path}: its {file.size} bytes unpack to more than {most} bytes of messages, as no sensor's do; "
-                "read a part with --start and --end, or leave the topic out with `mcap filter`"
-            )
-
-
-def stream(
-    path: Path,
-    keep: Callable[[str], Keep],
-    window: TimeWindow | None = None,
-    progress: Progress | None = None,
-    *,
-    salvage: bool = False,
-) -> Iterator[Topic]:
-    """Messages piece by piece: each item holds some messages of one topic, in the order of the file.
-
-    A piece is given as soon as it has 1 MiB, so memory does not grow with the file. Parameters and errors are those of
-    `scan`; without ``salvage`` also a file with holes is a LogError, at the end: what was given before is whole.
-    """
-    with LogFile(path) as file:
-        passage = Passage(file, keep, window, progress=progress)
-        held: dict[str, Topic] = {}
-        for piece in passage:
-            topic = held.get(piece.topic.name) or held.setdefault(piece.topic.name, piece.topic.empty())
-            topic.gather(piece.data, *piece.found)
-            if topic.held_bytes >= _PIECE_BYTES:
-                yield held.pop(topic.name)
-        yield from (topic for topic in held.values() if topic.keep is not Keep.NONE)
-    if not salvage:
-        Recording(path, damage=passage.damage).require_sound()

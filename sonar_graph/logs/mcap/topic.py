@@ -139,6 +139,16 @@ class Topic:
             self.stacks[size] = [(number[rows[is_kept[rows]]], payloads[is_kept[rows]]) for rows, payloads in parts]
         self.times, self._count = [self.log_times_ns[is_kept]], int(np.count_nonzero(is_kept))
 
+    def extend(self, later: Topic) -> None:
+        """Add the messages of the same topic in the next file of a log; a LogError where it has another type."""
+        if (self.type_name, self.encoding, self.schema_text) != (later.type_name, later.encoding, later.schema_text):
+            raise later.error(f"is a {later.type_name} defined otherwise than in the files before")
+        for size, parts in later.stacks.items():
+            self.stacks[size] += [(rows + self._count, payloads) for rows, payloads in parts]
+        self.times += later.times
+        self._count += later._count
+        self.held_bytes += later.held_bytes
+
     def empty(self) -> Topic:
         """The same topic without messages."""
         return replace(self, times=[], stacks=defaultdict(list), unsound={}, held_bytes=0, _count=0)
@@ -165,10 +175,13 @@ class Loss:
     """Number of lost messages by topic; None: not known."""
     is_estimate: bool = False
     """True where the numbers are estimated from the topics' rates."""
+    file: str = ""
+    """Name of the file, where a log has several."""
 
     def describe(self, beginning_ns: int | None) -> str:
         """Text with times in seconds after the log's beginning."""
-        text = f"bytes {self.at} to {self.end}: {self.reason}"
+        text = f"bytes {self.at} to {self.end}: {self.reason}" if self.end else self.reason
+        text = f"{self.file}: {text}" if self.file else text
         if self.start_ns is not None and self.end_ns is not None and beginning_ns is not None:
             start_s, end_s = ((ns - beginning_ns) / _NS_PER_S for ns in (self.start_ns, self.end_ns))
             text += f"; {start_s:.3f} s to {end_s:.3f} s of the log"
@@ -194,6 +207,17 @@ class Damage:
     """Faults that cost no messages."""
     unprotected: list[str] = field(default_factory=list)
     """Parts that were read without a CRC over them."""
+
+    def extend(self, later: Damage, file: str) -> None:
+        """Add the damage of the next file of a log: the end of any but the last is a loss in the middle."""
+        self.losses += [self.ending] if self.ending is not None else []
+        for loss in (*later.losses, *([later.ending] if later.ending is not None else [])):
+            loss.file = file
+        self.losses += later.losses
+        self.ending = later.ending
+        place = f"{file}: " if file else ""
+        self.remarks += [place + remark for remark in later.remarks]
+        self.unprotected += [place + part for part in later.unprotected]
 
 
 def settle(damage: Damage, topics: Mapping[str, Topic], counts: Mapping[str, int] | None) -> None:

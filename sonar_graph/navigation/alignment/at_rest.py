@@ -17,12 +17,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import AlignmentError
 from sonar_graph.measurements import Dvl, Floats, Imu
 from sonar_graph.navigation.alignment.gravity import earth_rate_in_world
+from sonar_graph.numerics import chi_square_exceeded
 
 LEAST_COSINE = 1e-3
 """Least cosine of pitch; roll has no meaning with the nose straight up or down."""
@@ -30,7 +30,20 @@ LEAST_COSINE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class InitialTilt:
-    """Roll, pitch and gyro bias at one instant, with their joint covariance."""
+    """Roll, pitch and gyro bias at one instant, with their joint covariance.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sonar_graph.navigation import align_at_rest
+    >>> from sonar_graph.testing import still_world
+    >>> world = still_world()
+    >>> tilt = align_at_rest(world.imu, world.calibration)
+    >>> print(f"roll {np.degrees(tilt.roll_rad):.2f}°, pitch {np.degrees(tilt.pitch_rad):.2f}°")
+    roll 5.73°, pitch -2.86°
+    >>> tilt.covariance.shape
+    (5, 5)
+    """
 
     stamp_ns: int
     """When it holds."""
@@ -165,7 +178,7 @@ def refuse_motion(imu: Imu, calibration: Calibration, dvl: Dvl | None) -> None:
         means = (np.add.reduceat(values, first, axis=0) / count[:, None])[:-1]
         freedom = means.size - means.shape[1]
         ratio = np.sqrt(np.sum((means - means.mean(axis=0)) ** 2) * BLOCK_S / freedom)
-        if ratio > LARGEST_NOISE_RATIO * np.sqrt(chi2.isf(FALSE_ALARM, freedom) / freedom) * density:
+        if ratio > LARGEST_NOISE_RATIO * np.sqrt(chi_square_exceeded(FALSE_ALARM, freedom) / freedom) * density:
             raise AlignmentError(
                 f"Imu.{name}: varies as a density of {ratio:.2g}, not imu.{field} = {density:.2g}; "
                 "the vehicle moved (give another stretch, or align in motion), or the density is too small"

@@ -24,7 +24,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
-from scipy.stats import chi2
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import AlignmentError
@@ -39,6 +38,7 @@ from sonar_graph.navigation.alignment.at_rest import (
 from sonar_graph.navigation.alignment.dvl_imu import InertialPath, cross_matrices
 from sonar_graph.navigation.imu_gaps import UNFELT_NS, row_after_hole
 from sonar_graph.navigation.samples import in_numbers, is_partial
+from sonar_graph.numerics import chi_square_exceeded
 
 FEWEST, SHORTEST_S, LONGEST_S = 10, 2.0, 60.0
 """Fewest samples of the Doppler log, the least time that they span, and the longest that is used."""
@@ -144,7 +144,7 @@ def align_in_motion(imu: Imu, dvl: Dvl, calibration: Calibration) -> InitialTilt
         if step < LARGEST_STEP_LEFT:
             break
     freedom = 3 * len(seconds) - 5
-    if misfit > LARGEST_MISFIT * chi2.isf(FALSE_ALARM, freedom):
+    if misfit > LARGEST_MISFIT * chi_square_exceeded(FALSE_ALARM, freedom):
         raise AlignmentError(
             f"alignment: velocities and accelerations differ {np.sqrt(misfit / freedom):.1f} times more than their "
             "noise says; check mountings and stamps with `sonar-graph inspect`, and the densities in the calibration"

@@ -278,7 +278,7 @@ class RowIntake:
             if later is None:
                 return None
             rows = later
-        if _repeated(rows.stamps_ns):
+        if len(rows.stamps_ns) > 1 and _repeated(rows.stamps_ns):
             rows = rows.rows(np.unique(rows.stamps_ns, return_index=True)[1])
         return rows
 

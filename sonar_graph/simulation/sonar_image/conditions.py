@@ -18,11 +18,11 @@ SCENES: dict[SceneName, dict[str, Any]] = {
     "easy": {},
     "murky": {"contrast_db": -3.0, "texture_shape": 2.0, "noise_db": 22.0},
     "worn": {
-        **{"contrast_db": -3.0, "foam_height_m": 0.012, "plate_db": -4.0, "sediment": 0.15, "fouling": 0.2},
+        **{"contrast_db": -3.0, "plate_db": -4.0, "sediment": 0.15, "fouling": 0.2},
         **{"texture_shape": 3.0},
     },
     "hard": {
-        **{"contrast_db": -4.5, "foam_height_m": 0.012, "plate_db": 0.0, "sediment": 0.25, "fouling": 0.25},
+        **{"contrast_db": -4.5, "plate_db": 0.0, "sediment": 0.25, "fouling": 0.25},
         **{"texture_shape": 1.5, "texture_length_m": 0.05, "noise_db": 20.0},
         **{"ripple_length_m": 0.12, "ripple_height_m": 0.012, "attitude_error_deg": 0.5, "altitude_error_m": 0.02},
         **{"strangers": ("natural", "look-alikes")},
@@ -40,8 +40,9 @@ class SceneConditions(Section):
     """Added to the level of landmarks' bright parts: -6 leaves 6 dB over the floor of foam of 12 dB."""
     plate_db: float | None = Field(None, ge=-30, le=30)
     """Level of landmarks' dark parts over the floor; 0: as bright as the floor; None: that of their designs."""
-    foam_height_m: float = Field(0.0, ge=0, le=0.1)
-    """Height of bright parts over dark ones, at most that of the landmark; 0: one height for all of its material."""
+    foam_height_m: float | None = Field(None, ge=0, le=0.1)
+    """Height of bright parts over dark ones, at most that of the landmark; 0: one height for all of its material; None:
+    that of their designs."""
     sediment: float = Field(0.0, ge=0, le=1)
     """Share of each landmark's area that drowned, in patches: they look like the floor."""
     fouling: float = Field(0.0, ge=0, le=1)

@@ -147,13 +147,14 @@ def place(
 
 
 def place_landmark(
-    design: LandmarkDesign, position_m: Floats, yaw_rad: float, floor_z_m: float, foam_height_m: float = 0.0
+    design: LandmarkDesign, position_m: Floats, yaw_rad: float, floor_z_m: float, foam_height_m: float | None = None
 ) -> SeabedObject:
     """Put a landmark on the floor, with its face at its true position (m, world) and a yaw in rad.
 
     The floor rises or falls around it by a smooth cosine as far as that needs. Parts darker than the floor lie lower
-    than the others by ``foam_height_m``, at most on the floor.
+    than the others by ``foam_height_m``, or where that is None by the relief of the design, at most on the floor.
     """
+    relief_m = design.standing_m if foam_height_m is None else foam_height_m
     bottom_m = float(position_m[2]) - design.height_m - floor_z_m
     pixels = len(design.mask)
     middle_m = ((np.arange(pixels) + 0.5) / pixels - 0.5) * design.size_m
@@ -164,7 +165,7 @@ def place_landmark(
         level_db = design.level_db(x_m, y_m)
         away = np.clip((np.hypot(x_m, y_m) - plate_m) / SLOPE_M, 0, 1)
         ground_m = bottom_m * 0.5 * (1 + np.cos(np.pi * away))
-        height_m = np.where(level_db > 0, design.height_m, max(design.height_m - foam_height_m, 0.0))
+        height_m = np.where(level_db > 0, design.height_m, max(design.height_m - relief_m, 0.0))
         return level_db, ground_m + np.where(np.isnan(level_db), 0.0, height_m)
 
     return place(design.id, design.name, shape, plate_m, position_m, yaw_rad, SLOPE_M)

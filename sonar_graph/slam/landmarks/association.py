@@ -4,10 +4,9 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from sonar_graph.measurements import Floats, Ints, LandmarkDetections
-from sonar_graph.numerics import compiled
+from sonar_graph.numerics import chi_square_quantile, compiled
 from sonar_graph.states import OUTCOME_NUMBERS, Outcome
 
 ACCEPTED = -1
@@ -55,4 +54,4 @@ def _write_identities(
 @cache
 def gate_threshold(probability: float, dof: int) -> float:
     """Squared Mahalanobis distance that a true innovation of ``dof`` components stays below with this probability."""
-    return float(chi2.ppf(probability, dof))
+    return chi_square_quantile(probability, dof)

@@ -84,6 +84,12 @@ class RobustIdentity(TrackedIdentity):
 
     Assumes that most sightings of every landmark are right, and that wrong ones disagree with each other: the kernel
     then lets the majority win, unless a landmark's first sighting is so far off that the others hardly pull.
+
+    Examples
+    --------
+    >>> from sonar_graph.slam import Isam2Params, RobustIdentity
+    >>> Isam2Params().identity == RobustIdentity(minimum_probability=0.7)
+    True
     """
 
     policy: Literal["robust"] = "robust"
@@ -94,6 +100,12 @@ class GatedIdentity(TrackedIdentity):
 
     Assumes that the estimate and its covariance are right when a detection comes: a detection outside the gate is
     refused, and not tried again unless its track changes its identity. Tracks change theirs as with "robust".
+
+    Examples
+    --------
+    >>> from sonar_graph.slam import GatedIdentity, Isam2Params
+    >>> Isam2Params(identity=GatedIdentity(gate_probability=0.99)).identity.policy
+    'gate'
     """
 
     policy: Literal["gate"] = "gate"

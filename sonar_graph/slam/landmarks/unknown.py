@@ -59,6 +59,13 @@ class AssociatedUnknown(Section):
     """Pair detections that name no landmark with landmarks by geometry.
 
     Begins landmarks with identities from 3000000000 on; docs/theory/unknown_landmarks.md says on what conditions.
+
+    Examples
+    --------
+    >>> from sonar_graph.slam import AssociatedUnknown, Isam2Params, RobustIdentity
+    >>> params = Isam2Params(identity=RobustIdentity(unknown=AssociatedUnknown(density_m2=0.01)))
+    >>> params.identity.unknown.policy, params.identity.unknown.sightings
+    ('associate', 5)
     """
 
     policy: Literal["associate"] = "associate"

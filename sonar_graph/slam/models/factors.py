@@ -27,7 +27,7 @@ from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Floats
 from sonar_graph.navigation import PreintegratedMotion
 from sonar_graph.numerics import cross_matrix
-from sonar_graph.slam.biases import ACCEL, COMPASS
+from sonar_graph.slam.biases import ACCEL, BIASES, COMPASS
 from sonar_graph.slam.models.aiding import HUBER_WIDTHS, yaw_and_derivative
 from sonar_graph.slam.models.correlated_sighting import CorrelatedSighting
 from sonar_graph.slam.models.kernels import Robust
@@ -213,14 +213,16 @@ def gravity_with_bias(
     ``by_accel``: A, derivative of the unit vector measured by the bias, shape (3, 3), s²/m.
     """
     measured = up_in_body / np.linalg.norm(up_in_body)
-    across = by_accel - np.outer(measured, measured @ by_accel)
+    across, by_bias = by_accel - np.outer(measured, measured @ by_accel), np.zeros((3, BIASES))
+    by_bias[:, ACCEL] = across
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:
-        up, b = values.atPose3(pose_key).rotation().matrix()[2], values.atVector(bias_key)
+        up = values.atPose3(pose_key).matrix()[2, :3]
         if jacobians is not None:
-            jacobians[0], jacobians[1] = np.hstack((cross_matrix(up), np.zeros((3, 3)))), np.zeros((3, len(b)))
-            jacobians[1][:, ACCEL] = across
-        return up + across @ b[ACCEL] - measured
+            by_pose = np.zeros((3, 6))
+            by_pose[:, :3] = cross_matrix(up)
+            jacobians[0], jacobians[1] = by_pose, by_bias
+        return up + across @ values.atVector(bias_key)[ACCEL] - measured
 
     return gtsam.CustomFactor(gtsam.noiseModel.Isotropic.Sigma(3, sigma_rad), [pose_key, bias_key], error)
 

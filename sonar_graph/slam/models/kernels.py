@@ -42,7 +42,14 @@ class Kernel(Section):
 
 
 class GaussianKernel(Kernel):
-    """No robust kernel: Gaussian noise."""
+    """No robust kernel: Gaussian noise.
+
+    Examples
+    --------
+    >>> from sonar_graph.slam import GaussianKernel, Isam2Params
+    >>> Isam2Params(kernel=GaussianKernel()).kernel.shape
+    'none'
+    """
 
     shape: Literal["none"] = "none"
 
@@ -52,6 +59,14 @@ class RobustKernel(Kernel):
 
     It may let an outlier at a landmark's first sighting be outvoted later, which a gate cannot, unless it lies too far
     off; where noise is Gaussian it costs next to nothing (measured in docs/theory/isam2.md).
+
+    Examples
+    --------
+    >>> from sonar_graph.slam import Isam2Params, RobustKernel
+    >>> Isam2Params(kernel=RobustKernel(shape="huber", width=1.345)).kernel
+    RobustKernel(shape='huber', width=1.345)
+    >>> Isam2Params().kernel
+    RobustKernel(shape='cauchy', width=1.5)
     """
 
     shape: Literal["huber", "cauchy"] = "cauchy"

@@ -43,7 +43,14 @@ ROUNDING_S = 1e-6
 
 
 class SmootherParams(Section):
-    """Settings of the incremental solution."""
+    """Settings of the incremental solution.
+
+    Examples
+    --------
+    >>> from sonar_graph.slam import Isam2Params, SmootherParams
+    >>> Isam2Params(smoother=SmootherParams(lag_s=60.0)).smoother.lag_s
+    60.0
+    """
 
     lag_s: float = Field(15.0, gt=0)
     """Age from which poses are marginalised out of the incremental solution; a large value keeps all of them."""
@@ -59,7 +66,14 @@ class SmootherParams(Section):
 
 
 class WholeHistory(Section):
-    """Every factor is kept, for the batch solution in `Isam2.trajectory`."""
+    """Every factor is kept, for the batch solution in `Isam2.trajectory`.
+
+    Examples
+    --------
+    >>> from sonar_graph.slam import Isam2Params, WholeHistory
+    >>> Isam2Params().history == WholeHistory()
+    True
+    """
 
     policy: Literal["whole"] = "whole"
 
@@ -69,6 +83,16 @@ class BoundedHistory(Section):
 
     Their information on landmarks and bias is kept; `Isam2.trajectory` is fixed-lag smoothed
     (docs/theory/bounded_memory.md).
+
+    Examples
+    --------
+    >>> from sonar_graph import run_estimator
+    >>> from sonar_graph.slam import BoundedHistory
+    >>> from sonar_graph.testing import small_world
+    >>> BoundedHistory().policy
+    'bounded'
+    >>> run_estimator(small_world(), "isam2", {"history.policy": "bounded"}).landmarks.ids
+    array([ 4,  9, 11])
     """
 
     policy: Literal["bounded"] = "bounded"

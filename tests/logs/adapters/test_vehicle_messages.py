@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.errors import LogError
+from sonar_graph.logs import inspect_log
 from sonar_graph.logs.adapters.landmark_messages import range_and_azimuth
 from sonar_graph.logs.adapters.vehicle_messages import body_to_ros, ros_to_body
 
@@ -249,6 +250,13 @@ def test_a_covariance_for_ros_is_that_of_sampled_poses_in_fixed_axes() -> None:
 def test_results_that_are_no_detections_are_refused(foreign: Any, entry: Entry, toml: str, message: str) -> None:
     with pytest.raises(LogError, match=message):
         foreign.read(entry, toml=toml)
+
+
+def test_a_text_class_is_no_damage_of_an_intact_log(foreign: Any) -> None:
+    summary = inspect_log(foreign.write(imu(), dvl(), one(("buoy", 0.9))))
+    assert summary.damage == ()
+    (reason,) = summary.unusable
+    assert "class 'buoy' is no integer identity" in reason
 
 
 @given(st.tuples(*[st.floats(-10, 10)] * 3), st.integers(0, 1000))

@@ -14,7 +14,8 @@ from sonar_graph.images import SonarFrames
 from sonar_graph.logs.convert.didson_aris import convert_aris, convert_didson
 from sonar_graph.logs.convert.oculus import convert_oculus
 from sonar_graph.logs.convert.sonar_file import SonarConversion
-from sonar_graph.logs.mcap.reader import Recording, scan
+from sonar_graph.logs.mcap.reader import Recording
+from sonar_graph.logs.mcap.scanning import scan
 from sonar_graph.logs.mcap.topic import Keep
 from sonar_graph.logs.reading import read_sonar_frames
 from sonar_graph.logs.vehicle_setup import read_calibration, read_notes

@@ -259,9 +259,9 @@ def test_the_log_has_the_name_of_the_recording_and_notes_what_is_lost(tmp_path):
     assert "cut off" in converted(tmp_path, b"".join(PIECES["aris"])[:-5], "aris").notes["sonar.shortcomings"]
 
 
-def run(*arguments: object) -> str:
+def run(*arguments: object, code: int = 0) -> str:
     done = CliRunner().invoke(app, [str(argument) for argument in arguments])
-    assert done.exit_code == 0, done.output
+    assert done.exit_code == code, done.output
     return done.output
 
 
@@ -271,7 +271,7 @@ def test_the_commands_say_what_was_read_and_lost(tmp_path, kind, ending):
     source.write_bytes(b"".join(PIECES[ending][:5])[:-7])
     said = run("convert", kind, source, "-o", log)
     assert all(words in said for words in ("dive.bin: 3 frames, 0.2 s", "lost: bytes", "cut off"))
-    said = run("inspect", log)
+    said = run("inspect", log, code=1)  # images alone are not usable for compare
     assert all(words in said for words in ("48 beams x 50 bins of uint8", "cut off"))
 
 

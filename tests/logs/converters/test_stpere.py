@@ -1,9 +1,13 @@
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from sonar_graph.errors import DatasetError
 from sonar_graph.evaluation.metrics import horizontal_aligned_rmse
-from sonar_graph.logs.convert.stpere import DVL_COLUMNS, read_stpere
+from sonar_graph.logs.convert import read_csv
+from sonar_graph.logs.convert.stpere import DVL_COLUMNS, GYRO_Z_BIAS_RAD_S, read_stpere
 
 T0 = 1_000
 MINUTE_M = 1852.0
@@ -14,12 +18,17 @@ MINUTE_M = 1852.0
 def folder(tmp_path):
     """Three seconds north of a level vehicle that heads north: its IMU's x axis points to the right, east."""
     inertial = [f"{T0 + k / 10:.1f} 0 0 90 0 0 {0.0116 - 0.02} 0.3 -0.2 -9.8" for k in range(31)]
-    (tmp_path / "MTI.log").write_text("% time, ...\n" + "\n".join(inertial))
+    of_three = [f"{kind}{axis}" for kind in ("position", "velocity", "acceleration") for axis in "XYZ"]
+    header = f"% time, [idSensor], {', '.join(of_three)}, \n"
+    (tmp_path / "MTI.log").write_text(header + "\n".join(inertial))
     ahead, rest = 50 * np.array([np.cos(np.pi / 3), np.sin(np.pi / 3)]), "0 " * (len(DVL_COLUMNS) - 15)
     doppler = [f"{T0 + k} 2007 3 16 13 0 {k} 9 9 9 1 {ahead[0]} {ahead[1]} 2 {int(k != 1)} {rest}" for k in range(4)]
     (tmp_path / "DVL.log").write_text("% time, ...\n" + "\n".join(doppler))
     fixes = [f"{T0 + k} {4212.0 + 0.5 * k / MINUTE_M:.8f} 306.0 1 {-2 - k} 51.8 0 0 0 0" for k in range(4)]
-    (tmp_path / "DGPS.log").write_bytes(b"% course(\xba)\n" + "\n".join(fixes).encode())
+    header = (
+        b"% time, [idSensor], latitude, longitude, status, altitude(m), geoide, course(\xba), magnetic, kts, km/h\n"
+    )
+    (tmp_path / "DGPS.log").write_bytes(header + "\n".join(fixes).encode())
     return tmp_path
 
 
@@ -41,6 +50,25 @@ def test_axes_units_and_biases_are_those_found_in_the_data(folder):
     compass = sequence.calibration.heading
     shared_and_own = np.hypot(compass.bias_sigma_rad, compass.sigma_rad)
     assert sequence.calibration.start.rpy_sigma_rad[2] == pytest.approx(shared_and_own), "the start is a compass' row"
+
+
+def test_the_lines_of_the_page_on_data_sets_read_the_tables_as_the_converter_does(folder):
+    page = (Path(__file__).parents[3] / "docs" / "theory" / "datasets.md").read_text(encoding="utf-8")
+    (lines,) = re.findall(r"### St. Pere from its tables.*?```toml\n(.*?)```", page, re.DOTALL)
+    (folder / "stpere.toml").write_text(lines)
+    found, expected = read_csv(folder, folder / "stpere.toml"), read_stpere(folder)
+    body_R_imu, body_R_dvl = (
+        section.mounting.pose().rotation().matrix() for section in (expected.calibration.imu, expected.calibration.dvl)
+    )
+    np.testing.assert_array_equal(found.imu.stamps_ns, expected.imu.stamps_ns)
+    np.testing.assert_array_equal(found.dvl.stamps_ns, expected.dvl.stamps_ns)
+    bias = np.array([0.0, 0.0, GYRO_Z_BIAS_RAD_S])  # taken off by the converter, as the mean of the level forces is
+    of_body = (expected.imu.angular_velocity + bias) @ body_R_imu.T
+    np.testing.assert_allclose(found.imu.angular_velocity, of_body, atol=1e-9)
+    np.testing.assert_allclose(found.imu.specific_force[:, 2], expected.imu.specific_force[:, 2], atol=1e-9)
+    np.testing.assert_allclose(found.dvl.velocity, expected.dvl.velocity @ body_R_dvl.T, atol=1e-9)
+    np.testing.assert_allclose(found.heading.yaw_rad, expected.heading.yaw_rad, atol=1e-5)
+    np.testing.assert_allclose(found.truth.positions, expected.truth.positions, atol=1e-6)
 
 
 def test_a_missing_file_or_folder_is_named(folder):

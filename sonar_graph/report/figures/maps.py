@@ -3,28 +3,26 @@
 The growing map is the counterpart of Fig. 4 of the 2014 paper, at its times or the same fractions of another run.
 """
 
+import math
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
-from scipy.stats import chi2
 
 from sonar_graph.evaluation import Comparison, RunResult, map_instants, scored_map
 from sonar_graph.measurements import Floats, Ints
+from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.report import figure_style as style
 from sonar_graph.states import LandmarkMap, Trajectory
 
 ELLIPSE_PROBABILITY = 0.95
 MARGIN = 0.3
 """Distance, in sizes of the truth, to which the map follows estimates that leave it."""
-WIDTH_IN = 7.4
-LEGEND_COLUMNS = 3
 SAME_M = 1e-3
 """A smoothed path nowhere farther than this from the causal one is not drawn a second time."""
 PATH_POINTS = 2500
-GROWTH_WIDTH_IN = 7.6
 ENLARGED = (1, 2, 5, 10, 20, 50)
 """Factors by which ellipses may be enlarged."""
 LARGEST_ELLIPSE = 0.09
@@ -34,13 +32,15 @@ LARGEST_ELLIPSE = 0.09
 def map_figure(comparison: Comparison) -> Figure | None:
     """Truth, causal and smoothed paths, landmarks with covariance ellipses; None where there is no path to draw.
 
-    Axes are world x and y in metres at one scale, nothing is aligned. The view holds the truth, true landmarks and as
+    Axes are world x and y in metres at one scale. The view holds the truth, true landmarks and as
     much around them as `MARGIN` says; `paths_cut_off` names the runs that leave it.
     """
     view = map_view(comparison)
     if view is None:
         return None
-    figure, axes = style.blank_panels(1, 1, (WIDTH_IN, WIDTH_IN))
+    factor = enlargement(comparison)
+    view = view if factor == 1 else with_room(view)
+    figure, axes = style.blank_panels(1, 1, (style.width_in(), style.width_in()))
     panel: Axes = axes[0, 0]
     truth, true_landmarks = comparison.sequence.truth, true_landmarks_drawn(comparison)
     if truth is not None and len(truth):
@@ -60,17 +60,13 @@ def map_figure(comparison: Comparison) -> Figure | None:
         if run.landmarks is not None and len(run.landmarks):
             look = {"markersize": 3.5, "markerfacecolor": "none", "label": f"{run.estimator}, landmarks"}
             panel.plot(*run.landmarks.positions.T[:2], "os^Dv<"[index % 6], color=own, zorder=4, **look)
-            for ellipse in ellipses(run.landmarks, own):
+            for ellipse in ellipses(run.landmarks, own, factor):
                 panel.add_patch(ellipse)
     label_landmarks(panel, comparison, view)
     panel.set(xlim=view[:, 0], ylim=view[:, 1])
     panel.set_aspect("equal", adjustable="box")
     style.name_axes(panel, "world x (m)", "world y (m)")
-    style.legend_above(figure, panel, columns=LEGEND_COLUMNS)
-    span = view[1] - view[0]  # axes of the view's shape fill the width; legend and labels need room above and below
-    legend_rows = -(-len(panel.get_legend_handles_labels()[1]) // LEGEND_COLUMNS)
-    drawing_in = np.clip((WIDTH_IN - 0.8) * span[1] / span[0], 2.5, 8.0)
-    figure.set_size_inches(WIDTH_IN, float(drawing_in) + 0.75 + 0.17 * legend_rows)
+    style.legend_above(figure, panel)
     return figure
 
 
@@ -132,9 +128,14 @@ def map_view(comparison: Comparison) -> Floats | None:
     return shown + np.array([[-1.0], [1.0]]) * 0.04 * largest
 
 
+def with_room(view: Floats) -> Floats:
+    """The view, widened by what the largest ellipse may need."""
+    return np.asarray(view + np.array([[-1.0], [1.0]]) * LARGEST_ELLIPSE * float((view[1] - view[0]).max()))
+
+
 def ellipses(landmarks: LandmarkMap, edge: str, enlarged: float = 1.0) -> list[Ellipse]:
     """Horizontal ellipses that hold each landmark with `ELLIPSE_PROBABILITY`; none where the covariance is unknown."""
-    scale = enlarged * 2 * np.sqrt(chi2.ppf(ELLIPSE_PROBABILITY, 2))
+    scale = enlarged * 2 * math.sqrt(chi_square_quantile(ELLIPSE_PROBABILITY, 2))
     ellipses = []
     for position, cov in zip(landmarks.positions, landmarks.covariances[:, :2, :2], strict=True):
         if not np.isfinite(cov).all():
@@ -154,7 +155,7 @@ def label_landmarks(panel: Axes, comparison: Comparison, view: Floats) -> None:
     landmarks = next((known for known in candidates if known is not None and len(known)), None)
     if landmarks is None:
         return
-    size = style.TICK_SIZE if len(landmarks) <= 40 else 6.0
+    size = "medium" if len(landmarks) <= 40 else "x-small"
     for identity, position in zip(landmarks.ids.tolist(), landmarks.positions[:, :2], strict=True):
         if np.all((position >= view[0]) & (position <= view[1])):
             panel.annotate(
@@ -176,22 +177,20 @@ def horizontal(trajectory: Trajectory) -> tuple[Floats, Floats]:
 
 
 def growth_figure(comparison: Comparison) -> Figure | None:
-    """A row a run, a column a time: causal path until then, landmarks with ellipses as known then, not aligned."""
+    """A row a run, a column a time: causal path until then, landmarks with ellipses as known then."""
     view, runs = map_view(comparison), _runs_with_maps(comparison)
     if view is None or not runs:
         return None
-    view = view + np.array([[-1.0], [1.0]]) * LARGEST_ELLIPSE * float((view[1] - view[0]).max())
+    view = with_room(view)
     stamps_ns = grown_at(comparison)
     enlarged = enlargement(comparison)
-    span = view[1] - view[0]
-    height_in = np.clip(GROWTH_WIDTH_IN / len(stamps_ns) * span[1] / span[0], 1.2, 4.0)
-    size = GROWTH_WIDTH_IN, float(height_in) * len(runs) + 0.5
+    size = style.width_in(), style.width_in()
     figure, axes = style.blank_panels(len(runs), len(stamps_ns), size, sharex=True, sharey=True)
+    true = true_landmarks_drawn(comparison)
     for row, (index, run) in enumerate(runs):
         for column, stamp_ns in enumerate(stamps_ns.tolist()):
             panel: Axes = axes[row, column]
-            own, true = style.colour(index), true_landmarks_drawn(comparison)
-            truth = comparison.sequence.truth
+            own, truth = style.colour(index), comparison.sequence.truth
             _draw_until(panel, stamp_ns, truth, color=style.TRUTH, linewidth=2.6, alpha=0.6, label="truth")
             _draw_until(panel, stamp_ns, run.causal, color=own, linewidth=1.0, label="causal estimate")
             if true is not None:
@@ -204,17 +203,8 @@ def growth_figure(comparison: Comparison) -> Figure | None:
             label_landmarks(panel, comparison, view)
             panel.set(xlim=view[:, 0], ylim=view[:, 1])
             panel.set_aspect("equal", adjustable="box")
-            style.name_axes(panel, "world x (m)" if row == len(runs) - 1 else "", "" if column else "world y (m)")
-        axes[row, 0].annotate(
-            run.estimator,
-            (-0.34, 0.5),
-            xycoords="axes fraction",
-            rotation=90,
-            va="center",
-            color=style.colour(index),
-            fontsize=style.LABEL_SIZE,
-            fontweight="bold",
-        )
+            label = "" if column else f"{run.estimator}\nworld y (m)"
+            style.name_axes(panel, "world x (m)" if row == len(runs) - 1 else "", label)
     for column, seconds in enumerate(style.seconds_since_start(comparison, stamps_ns)):
         style.head_panel(axes[0, column], f"T = {seconds:.1f} s")
     style.legend_above(figure, axes[0, 0])
@@ -229,19 +219,19 @@ def grown_at(comparison: Comparison) -> Ints:
 
 def enlargement(comparison: Comparison) -> int:
     """The factor by which ellipses are enlarged, so that they can be seen and do not cover each other."""
-    view = map_view(comparison)
+    view, grown_ns = map_view(comparison), grown_at(comparison)
     sigmas = [
         np.sqrt(np.linalg.eigvalsh(cov).max())
         for _, run in _runs_with_maps(comparison)
         for known in run.maps
-        if known.stamp_ns in grown_at(comparison)
+        if known.stamp_ns in grown_ns
         for cov in known.landmarks.covariances[:, :2, :2]
         if np.isfinite(cov).all()
     ]
     if view is None or not sigmas:
         return 1
     room_m = LARGEST_ELLIPSE * float((view[1] - view[0]).max())
-    half_m = float(max(sigmas)) * float(np.sqrt(chi2.ppf(ELLIPSE_PROBABILITY, 2)))
+    half_m = float(max(sigmas)) * math.sqrt(chi_square_quantile(ELLIPSE_PROBABILITY, 2))
     return max((factor for factor in ENLARGED if factor * half_m <= room_m), default=1)
 
 

@@ -1,0 +1,88 @@
+"""Messages between the transport's thread and the one that takes them, and topics from which nothing comes any more."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter, deque
+from collections.abc import Iterator
+
+from sonar_graph.live.live_messages import Message
+
+SILENT_S = 5.0
+"""Time without a message after which the user is told."""
+
+
+class Inbox:
+    """Messages that wait to be taken, bounded: the oldest are dropped and counted."""
+
+    def __init__(self, most_bytes: int = 1 << 28) -> None:
+        self.dropped: Counter[str] = Counter()
+        self._messages: deque[Message] = deque()
+        self._bytes, self._most_bytes = 0, most_bytes
+        self._changed = threading.Condition()
+
+    def put(self, message: Message) -> None:
+        """Append a message."""
+        with self._changed:
+            self._messages.append(message)
+            self._bytes += len(message.payload)
+            while self._bytes > self._most_bytes:
+                oldest = self._messages.popleft()
+                self._bytes -= len(oldest.payload)
+                self.dropped[oldest.topic] += 1
+            self._changed.notify()
+
+    def take(self, timeout_s: float) -> list[Message]:
+        """All messages that wait; an empty list if none comes in time."""
+        with self._changed:
+            if not self._messages:
+                self._changed.wait(timeout_s)
+            messages = list(self._messages)
+            self._messages.clear()
+            self._bytes = 0
+            return messages
+
+
+class Silence:
+    """Topics that have sent, and for how long nothing came of them; each silence is said once, and its end.
+
+    Examples
+    --------
+    >>> silence = Silence()
+    >>> for at_s in (0.0, 1.0):
+    ...     silence.heard("/imu/data", at_s), silence.heard("/dvl/data", at_s)
+    >>> list(silence.lines({"/imu/data", "/dvl/data"}, at_s=4.0))
+    []
+    >>> list(silence.lines({"/imu/data", "/dvl/data"}, at_s=7.0))
+    ['nothing comes any more since 6 s: does the sender run?']
+    >>> silence.heard("/imu/data", 9.0)
+    >>> list(silence.lines({"/imu/data", "/dvl/data"}, at_s=9.5))
+    ['/imu/data comes again, after 8 s', '/dvl/data: nothing since 8 s']
+    """
+
+    def __init__(self) -> None:
+        self._heard_s: dict[str, float] = {}
+        self._ended: dict[str, float] = {}
+        """Silences that have ended, by topic, in seconds."""
+        self._said: set[str] = set()
+
+    def heard(self, topic: str, at_s: float) -> None:
+        """Note that a message of a topic came."""
+        if topic in self._said:
+            self._said.discard(topic)
+            self._ended[topic] = at_s - self._heard_s[topic]
+        self._heard_s[topic] = at_s
+
+    def lines(self, topics: set[str], at_s: float) -> Iterator[str]:
+        """What there is to say about topics that should send all the time."""
+        for topic, after_s in self._ended.items():
+            yield f"{topic} comes again, after {after_s:.0f} s"
+        self._ended.clear()
+        known = {topic: at_s - heard_s for topic, heard_s in self._heard_s.items() if topic in topics}
+        silent = {topic: for_s for topic, for_s in known.items() if for_s > SILENT_S}
+        new = silent.keys() - self._said
+        if new and len(silent) == len(known):
+            yield f"nothing comes any more since {min(silent.values()):.0f} s: does the sender run?"
+        else:
+            yield from (f"{topic}: nothing since {silent[topic]:.0f} s" for topic in sorted(new))
+        self._said |= new

@@ -1,0 +1,71 @@
+"""Files of a log that is a folder: those that the ``metadata.yaml`` of ``ros2 bag record`` names, or all, in order."""
+
+import re
+from itertools import pairwise
+from pathlib import Path
+
+from sonar_graph.errors import LogError
+from sonar_graph.files import text_of
+from sonar_graph.logs.mcap.file_summary import first_time_ns, read_summary
+from sonar_graph.logs.mcap.records import LogFile
+
+METADATA_FILE = "metadata.yaml"
+
+
+def log_parts(path: Path) -> list[Path]:
+    """Files of a log in the order of their times; of a log that is a file, that one.
+
+    Files that ``metadata.yaml`` names are given also where they do not exist.
+
+    Raises LogError where a folder holds no MCAP files, those of a bag in another form, or two recordings of one time.
+    """
+    if not path.is_dir():
+        return [path]
+    if (path / METADATA_FILE).is_file():
+        return _named_parts(path)
+    files = [file for file in path.iterdir() if file.suffix == ".mcap" and file.is_file()]
+    if not files:
+        raise LogError(
+            f"{path}: is a folder without {METADATA_FILE} and .mcap files; give a log, or the folder of a bag that "
+            "`ros2 bag record` wrote"
+        )
+    spans = sorted(((*_span_ns(file), file) for file in files), key=lambda span: (span[0], span[2].name))
+    for (_, end_ns, before), (begin_ns, _, after) in pairwise(spans):
+        if end_ns is not None and begin_ns < end_ns:
+            raise LogError(
+                f"{path}: {after.name} begins before {before.name} ends: these are two recordings and not parts "
+                "of one; give one of them"
+            )
+    return [file for _, _, file in spans]
+
+
+def _named_parts(folder: Path) -> list[Path]:
+    try:
+        text = text_of(folder / METADATA_FILE)
+    except (OSError, UnicodeDecodeError) as error:
+        raise LogError(f"{folder / METADATA_FILE}: cannot be read: {error}") from error
+    storage = re.search(r"storage_identifier:\s*['\"]?(\w+)", text)
+    if storage is not None and storage[1] != "mcap":
+        raise LogError(
+            f"{folder}: is a ROS 2 bag of the {storage[1]} kind; `sonar-graph convert rosbag {folder} -o "
+            f"{folder.name}.mcap` makes a log of it"
+        )
+    listed = re.search(r"relative_file_paths:[ \t]*\n((?:[ \t]*-[^\n]*\n?)+)", text)
+    flow = re.search(r"relative_file_paths:[ \t]*\[(.*?)\]", text, re.DOTALL)
+    rows = listed[1].split("\n") if listed else flow[1].split(",") if flow else []
+    names = [name for row in rows if (name := row.strip().removeprefix("-").strip(" '\""))]
+    if not names:
+        raise LogError(f"{folder / METADATA_FILE}: names no files under relative_file_paths; `ros2 bag reindex` does")
+    if packed := next((name for name in names if not name.endswith(".mcap")), None):
+        raise LogError(
+            f"{folder}: {packed} is no .mcap file; unpack the files first (`zstd -d`), then `ros2 bag reindex`"
+        )
+    return [folder / name for name in names]
+
+
+def _span_ns(file: Path) -> tuple[int, int | None]:
+    """Times of the first message and, where the file's summary says it, of the last."""
+    with LogFile(file) as log:
+        summary, _ = read_summary(log)
+        end_ns = None if summary is None or summary.statistics is None else int(summary.statistics.message_end_time)
+        return first_time_ns(log, summary), end_ns

@@ -1,0 +1,28 @@
+"""The chi-square distribution, digit for digit that of scipy.stats, which takes a second to load."""
+
+import numpy as np
+from scipy.special import chdtr, chdtri, gammaincinv
+
+from sonar_graph.measurements import Floats
+
+
+def chi_square_quantile(probability: float, dof: float) -> float:
+    """Value that a chi-square variable of so many degrees of freedom stays below with this probability.
+
+    Examples
+    --------
+    >>> from sonar_graph.numerics import chi_square_quantile
+    >>> round(chi_square_quantile(0.95, 2), 3)
+    5.991
+    """
+    return 2.0 * float(gammaincinv(0.5 * dof, probability))
+
+
+def chi_square_exceeded(probability: float, dof: float) -> float:
+    """Value that it exceeds with this probability; for small ones exacter than `chi_square_quantile` of the rest."""
+    return float(chdtri(dof, probability))
+
+
+def chi_square_share(values: Floats, dof: float) -> Floats:
+    """Probability that it stays below each of the values, of the same shape."""
+    return np.asarray(chdtr(dof, values), np.float64)

@@ -1,0 +1,133 @@
+"""Place of a landmark in a patch, to a fraction of a cell: least squares of its figure, with the relief that it has.
+
+Foam stands over the plate, or over the floor, by t. A sonar at a height h and a distance d meets the top of its near
+side first: the side is laid over the first ``t h / d`` of the face, in the plane of the face, and makes it brighter.
+Behind the far edge ``t (d / h + h / d)`` are dark. Without both a fit comes out too near by some 5 mm. With B the
+figure, W what its side adds for each metre, D its dark parts, S its shadow and p its place::
+
+    z = floor + beta (B + t h / d W) + delta D (1 - S) + gamma S + e
+
+all but the floor shifted by p. Gauss-Newton: beta, delta, gamma and p are solved for together, with the slopes of the
+figures at the levels before. Derivation: docs/theory/recognition.md.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from sonar_graph.devices import LandmarkDesign
+from sonar_graph.measurements import Floats, Ints
+from sonar_graph.numerics import compiled
+from sonar_graph.sonar.templates import FINE, Blur, Floats32, echo_power, seen_db, seen_share
+
+SIDE_DB, SIDE_M = 7.9, 0.006
+"""Level of a face with its side laid over it, over that of the face alone, and the width for which it is drawn.
+
+``1 + (d / h)^3`` by Lambert's law, at a grazing angle of 30 degrees: the side is met more steeply, ``(d / h)^2``, and
+has d / h times the area on the same width.
+"""
+SHADES, SHADE_FINE = 12, FINE // 2
+"""Shadows that are drawn: number, and by how many points of the fine grid each is longer than the one before."""
+STEPS = 2
+"""Gauss-Newton steps from the best cell on."""
+LEAST_BETA_DB, LEAST_CELLS = 0.05, 20
+
+
+class Relief(NamedTuple):
+    """A design at one heading and what its height adds, on the grid of the templates, shapes (side, side)."""
+
+    figure: Floats32
+    """B, dB."""
+    side: Floats32
+    """W, dB for each metre of the face that the side covers."""
+    dark: Floats32
+    """D, dB."""
+    shades: Floats32
+    """Shares of the cells in the shadows, of length 0 first, shape (SHADES + 1, side, side)."""
+
+    @classmethod
+    def of(cls, design: LandmarkDesign, heading_rad: float, side: int, cell_m: float, blur_m: Blur) -> Relief:
+        """A design at this heading against the direction away from the sonar, which is the grid's x axis."""
+        of_bright, power = echo_power(design, heading_rad, side, cell_m)
+        is_bright = power > 1
+        shaded, inner = is_bright.copy(), is_bright.copy()
+        for _ in range(round(SIDE_M / cell_m * FINE)):
+            inner[1:] &= inner[:-1]
+        with_side = np.where(is_bright & ~inner, power * np.float32(10 ** (SIDE_DB / 10)), power)
+        bright, whole, raised = (seen_db(one, cell_m, blur_m) for one in (of_bright, power, with_side))
+        shades = [np.zeros_like(bright)]
+        for _ in range(SHADES):
+            for _ in range(SHADE_FINE):
+                shaded[1:] |= shaded[:-1]
+            shades.append(seen_share(shaded & ~is_bright, cell_m, blur_m))
+        return cls(bright, (raised - whole) / SIDE_M, whole - bright, np.stack(shades))
+
+    def place(
+        self, level_db: Floats32, seen: Floats32, cells: tuple[Ints, Ints], start: Floats, side_m: float,
+        shadow_cells: float,
+    ) -> tuple[Floats, Floats]:  # fmt: skip
+        """Place of the first cell of the figure's square in a patch, and the bound of its standard deviation, in cells.
+
+        Parameters
+        ----------
+        level_db, seen
+            Of the patch, shapes (n, n).
+        cells
+            Rows and columns of the square that are compared.
+        start
+            Place at which to begin, shape (2,).
+        side_m, shadow_cells
+            Width of the face that the side covers, and length of the shadow.
+        """
+        place, bound = start.astype(float), np.full(2, np.inf)
+        at = min(shadow_cells * FINE / SHADE_FINE, SHADES - 1e-9)
+        k = int(at)
+        shade = self.shades[k] + np.float32(at - k) * (self.shades[k + 1] - self.shades[k])
+        fit_place(
+            level_db, seen, *cells, self.figure + np.float32(side_m) * self.side, self.dark * (1 - shade), shade,
+            place, bound,
+        )  # fmt: skip
+        return place, bound
+
+
+@compiled
+def fit_place(
+    level_db: Floats32, seen: Floats32, rows: Ints, columns: Ints, figure: Floats32, dark: Floats32, shade: Floats32,
+    place: Floats, bound: Floats,
+) -> None:  # fmt: skip
+    """Move a place to the least squares, and fill in the Cramer-Rao bound of its standard deviations, in cells.
+
+    ``M = [1, B, D, S, dz/dx, dz/dy]`` with ``dz/dp = -(beta grad B + delta grad D + gamma grad S)``; the bound is the
+    root of the last two on the diagonal of ``s^2 (M^T M)^-1``, s^2 the mean square of what is left.
+    """
+    beta, delta, gamma = np.float32(0), np.float32(0), np.float32(0)
+    side, last, count = len(figure), len(level_db) - 1, np.float32(0)
+    mean = np.float32(np.sum(level_db * seen) / max(np.sum(seen), 1.0))
+    for step in range(STEPS + 1):
+        size, x0, y0 = 4 if step == 0 else 6, round(place[0]), round(place[1])
+        whole = beta * figure + delta * dark + gamma * shade
+        M = np.zeros((7, len(rows)), np.float32)
+        for n in range(len(rows)):
+            i, j = rows[n], columns[n]
+            x, y = x0 + i, y0 + j
+            if 0 <= x <= last and 0 <= y <= last and seen[x, y] > 0:
+                before, after, left, right = max(i - 1, 0), min(i + 1, side - 1), max(j - 1, 0), min(j + 1, side - 1)
+                M[0, n], M[1, n], M[2, n], M[3, n] = 1, figure[i, j], dark[i, j], shade[i, j]
+                M[4, n] = (whole[before, j] - whole[after, j]) / np.float32(after - before)
+                M[5, n] = (whole[i, left] - whole[i, right]) / np.float32(right - left)
+                M[6, n] = level_db[x, y] - mean
+        products = np.dot(M, M.T).astype(np.float64)
+        count = products[0, 0]
+        if count < LEAST_CELLS:
+            return
+        G, g = products[:size, :size] + 1e-6 * np.eye(size), products[:size, 6].copy()
+        c = np.linalg.solve(G, g)
+        beta, delta, gamma = np.float32(max(c[1], LEAST_BETA_DB)), np.float32(max(c[2], 0)), np.float32(min(c[3], 0))
+        if size == 6:
+            variance, inverse = max(products[6, 6] - np.dot(c, g), 0.0) / count, np.linalg.inv(G)
+            for a in range(2):
+                place[a] = (x0, y0)[a] + min(max(c[4 + a], -1.0), 1.0)
+                bound[a] = math.sqrt(variance * inverse[4 + a, 4 + a])

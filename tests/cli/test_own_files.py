@@ -1,0 +1,159 @@
+"""Wrong uses on the way from own files to a report: one line each, which names the place and says what to do."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sonar_graph.logs import write_log
+from sonar_graph.measurements import Dvl
+from sonar_graph.states import Trajectory
+from sonar_graph.testing import small_world
+
+IMU = """[imu]
+file = "imu.csv"
+angular_velocity = ["wx", "wy", "wz"]
+linear_acceleration = ["ax", "ay", "az"]
+"""
+DVL = '[dvl]\nfile = "dvl.csv"\nvelocity = ["vx", "vy", "vz"]\n'
+TRUTH = '[truth]\nfile = "truth.csv"\nposition = ["x", "y", "z"]\n'
+
+
+def rows(stamps_ns: np.ndarray, *columns: np.ndarray) -> list[str]:
+    table = np.column_stack(columns).tolist()
+    return [",".join(map(repr, [ns * 1e-9, *row])) for ns, row in zip(stamps_ns.tolist(), table, strict=True)]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """Tables and logs of one dive, good ones and spoilt ones."""
+    path, world = tmp_path_factory.mktemp("own"), small_world()
+    imu = ["time,wx,wy,wz,ax,ay,az", *rows(world.imu.stamps_ns, world.imu.angular_velocity, world.imu.specific_force)]
+    dvl = ["time,vx,vy,vz", *rows(world.dvl.stamps_ns, world.dvl.velocity)]
+    word, short, late, time = list(imu), list(imu), list(imu), list(imu)
+    word[7] = word[7].replace(",", ",fast,", 1).rpartition(",")[0]
+    short[9] = short[9].rpartition(",")[0]
+    late[20], late[900] = late[900], late[20]
+    time[5] = "noon" + time[5][time[5].index(",") :]
+    tables = {"imu": imu, "dvl": dvl, "word": word, "short": short, "late": late, "noon": time, "header": imu[:1]}
+    tables["comma"] = [line.replace(",", ";").replace(".", ",") for line in dvl]
+    tables["gap"] = [dvl[0], *(re.sub(r"^[^,]*", lambda m: repr(float(m[0]) + 1e6), row) for row in dvl[1:])]
+    for name, lines in tables.items():
+        (path / f"{name}.csv").write_text("\n".join(lines) + "\n")
+    (path / "empty.csv").write_text("")
+    (path / "image.csv").write_bytes(b"\x89PNG\0\0")
+    configurations = {
+        "good": IMU + DVL,
+        "no_dvl": IMU,
+        "truth": IMU + DVL + TRUTH,
+        "half": IMU + DVL.replace('"vx", ', ""),
+    }
+    configurations |= {
+        name: IMU.replace("imu.csv", f"{name}.csv") + DVL
+        for name in ("word", "short", "noon", "header", "empty", "image", "late")
+    }
+    configurations |= {name: IMU + DVL.replace("dvl.csv", f"{name}.csv") for name in ("comma", "gap")}
+    configurations |= {
+        "column": IMU.replace('"wx"', '"gyro_x"') + DVL,
+        "role": IMU + DVL.replace("[dvl]", "[dlv]"),
+        "key": IMU + DVL + 'units = "mm/s"\n',
+        "unit": IMU + DVL + 'scale = "furlongs"\n',
+        "topic": IMU + DVL + 'topic = "/dvl"\n',
+    }
+    for name, text in configurations.items():
+        (path / f"{name}.toml").write_text(text)
+    write_log(path / "dive.mcap", world)
+    fast = Dvl(world.dvl.stamps_ns, 1000.0 * world.dvl.velocity, world.dvl.velocity_cov)
+    write_log(path / "fast.mcap", replace(world, dvl=fast, detections=None))
+    (path / "bag").mkdir()
+    listed = "  storage_identifier: mcap\n  relative_file_paths:\n    - lost_0.mcap\n"
+    (path / "bag" / "metadata.yaml").write_text(f"rosbag2_bagfile_information:\n{listed}")
+    (path / "wall").write_text("a file")
+    return path
+
+
+CSV = "convert csv . -o new.mcap --config"
+WRONG = {
+    f"{CSV} absent.toml": r"absent\.toml",
+    "convert csv absent.csv --config good.toml -o new.mcap": r"absent\.csv",
+    "convert csv imu.csv dvl.csv -o new.mcap": r"--config is missing; `.* csv imu\.csv dvl\.csv --toml > dive",
+    "convert csv imu.csv dvl.csv --config good.toml": "-o is missing",
+    "convert csv imu.csv --config good.toml -o new.mcap": r"\[dvl\] file: dvl\.csv is not among the tables; .*imu\.csv",
+    f"{CSV} no_dvl.toml": r"no_dvl\.toml: has no table \[dvl\]; every estimator needs IMU and Doppler log",
+    f"{CSV} truth.toml": r"truth\.csv is not among the tables",
+    f"{CSV} half.toml": r"half\.toml: \[dvl\] velocity: expected 3 values",
+    f"{CSV} column.toml": r"imu\.csv: has no column 'gyro_x' \(\[imu\] angular_velocity\); it has time, wx, wy, wz",
+    f"{CSV} role.toml": r"there is no role \[dlv\]; did you mean \[dvl\][?]",
+    f"{CSV} key.toml": r"key\.toml: \[dvl\] units: there is no such field",
+    f"{CSV} unit.toml": r"unit\.toml: \[dvl\] scale: expected a factor or one of the units m/s, cm/s, mm/s",
+    f"{CSV} topic.toml": r"\[dvl\] topic: is for messages; a table has columns: take it out",
+    f"{CSV} word.toml": r"word\.csv, line 8: column wx: 'fast' is no number; expected one, or nothing where",
+    f"{CSV} short.toml": r"short\.csv, line 10: has 6 cells; expected 7",
+    f"{CSV} noon.toml": r"noon\.csv, line 6: column time: 'noon' is no time; expected a number",
+    f"{CSV} header.toml": r"header\.csv: has no line with numbers after the header 'time,wx,.*it is empty",
+    f"{CSV} empty.toml": r"empty\.csv: has no line with numbers; expected a table",
+    f"{CSV} image.toml": r"image\.csv, line 1: is no text",
+    f"{CSV} comma.toml": r'comma\.csv: has no line with numbers like 1\.5; .* need decimal = ","',
+    f"{CSV} gap.toml": "no common time; of another clock or unit[?] See stamp, stamp_unit_s and stamp_offset_s",
+    "convert csv . --config good.toml -o wall/new.mcap": r"wall/new\.mcap: cannot be written: .*choose another place",
+    "convert csv . --config good.toml -o new.csv": r"logs are MCAP files",
+    "inspect bag": r"lost_0\.mcap",
+    "compare dive.mcap -o wall": "wall: is a file; give a folder",
+    "compare dive.mcap -o out --calibration imu.csv": r"imu\.csv: not TOML",
+    "calibration --template absent.mcap": r"absent\.mcap",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("command", "expected"), WRONG.items())
+def test_a_wrong_use_is_one_line_that_says_what_to_do(run, folder, command, expected, monkeypatch, capsys):
+    before = sorted(folder.rglob("*"))
+    monkeypatch.chdir(folder)
+    assert run(*command.split()) == 2
+    said = capsys.readouterr().err
+    assert re.fullmatch(r"sonar-graph: .+\n", said)
+    assert re.search(expected, said), said
+    assert sorted(folder.rglob("*")) == before
+
+
+def test_times_that_run_backwards_are_sorted_and_named(run, folder, tmp_path, capsys):
+    words = "convert", "csv", folder, "--config", folder / "late.toml", "-o", tmp_path / "late.mcap"
+    assert run(*words) == 0
+    assert re.search(r"warning: imu: 2 times backwards, by .* rows are sorted", capsys.readouterr().err)
+
+
+@pytest.mark.parametrize("command", ["run", "compare"])
+def test_velocities_a_thousand_times_too_large_are_named_before_the_numbers(run, folder, tmp_path, command, capsys):
+    names = ("--estimator" if command == "run" else "--estimators", "dead-reckoning")
+    run(command, folder / "fast.mcap", "-o", tmp_path / "out", *names)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "Warning: DVL: unit: velocities look 1000 times too large" in said
+    assert "`scale = 0.001` under [dvl]" in said
+
+
+def test_a_start_that_nobody_stated_is_said_and_errors_are_after_the_fit(run, folder, tmp_path, capsys):
+    world = small_world()
+    far = Trajectory.of_positions(world.truth.stamps_ns, world.truth.positions[:, [1, 0, 2]] * [-1, 1, 1] + 5e5)
+    bare = world.calibration.model_copy(update={"start": type(world.calibration.start)()})
+    bare.model_fields_set.discard("start")
+    write_log(tmp_path / "free.mcap", replace(world, truth=far, calibration=bare, true_landmarks=None))
+    out = tmp_path / "out"
+    assert run("compare", tmp_path / "free.mcap", "-o", out, "--estimators", "dead-reckoning") == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "Truth: the log states no start, so the truth was brought into the world of the estimates" in said
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert "The log states no start, so the truth was brought into the world of the estimates" in page
+
+
+def test_inspect_ends_with_a_status_for_scripts(run, folder, tmp_path, capsys):
+    world = small_world()
+    assert run("inspect", folder / "dive.mcap", "--quick") == 0
+    assert run("inspect", folder / "fast.mcap") == 3
+    frd = replace(world.imu, specific_force=world.imu.specific_force * [1, -1, -1])
+    write_log(tmp_path / "frd.mcap", replace(world, imu=frd))
+    assert run("inspect", tmp_path / "frd.mcap", "--quick") == 3
+    content = (folder / "dive.mcap").read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(content[: len(content) // 2])
+    assert run("inspect", tmp_path / "cut.mcap", "--quick") == 1
+    capsys.readouterr()

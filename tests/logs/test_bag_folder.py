@@ -1,0 +1,176 @@
+"""A folder of MCAP files, as ``ros2 bag record`` splits a recording, is the log that one file would be."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from sonar_graph.errors import LogError
+from sonar_graph.live.live_messages import recorded_messages
+from sonar_graph.logs import inspect_log, read_log, write_amended, write_log
+from sonar_graph.logs.mcap import Instant, Keep, TimeWindow, log_parts, stream
+from sonar_graph.logs.mcap.scanning import scan
+from sonar_graph.testing import small_world
+
+METADATA = """rosbag2_bagfile_information:
+  version: 5
+  storage_identifier: {storage}
+  relative_file_paths:
+{names}
+  duration:
+    nanoseconds: 20000000000
+"""
+NAMES = [f"dive_{part}.mcap" for part in range(12)]
+"""More than ten, so that the order of names is none of times."""
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("whole") / "dive.mcap"
+    write_log(path, small_world())
+    return path
+
+
+@pytest.fixture
+def folder(whole, tmp_path) -> Path:
+    """The same log, split by time."""
+    folder = tmp_path / "dive"
+    folder.mkdir()
+    with whole.open("rb") as stream_:
+        reader = make_reader(stream_)
+        messages = list(reader.iter_messages())
+        records = list(reader.iter_metadata())
+    edges = np.linspace(0, len(messages), len(NAMES) + 1).astype(int)
+    for name, first, last in zip(NAMES, edges[:-1], edges[1:], strict=True):
+        with (folder / name).open("wb") as out:
+            writer = Writer(out, chunk_size=2000, enable_data_crcs=True)
+            writer.start(profile="ros2")
+            channels: dict[str, int] = {}
+            for schema, channel, message in messages[first:last]:
+                if channel.topic not in channels:
+                    number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                    channels[channel.topic] = writer.register_channel(
+                        channel.topic, channel.message_encoding, number, channel.metadata
+                    )
+                writer.add_message(
+                    channels[channel.topic], message.log_time, message.data, message.publish_time, message.sequence
+                )
+            for record in records if first == 0 else []:
+                writer.add_metadata(record.name, record.metadata)
+            writer.finish()
+    return folder
+
+
+def with_metadata(folder: Path, names: list[str] = NAMES, storage: str = "mcap") -> Path:
+    listed = "\n".join(f"    - {name}" for name in names)
+    (folder / "metadata.yaml").write_text(METADATA.format(storage=storage, names=listed))
+    return folder
+
+
+def contents(path: Path) -> dict[str, list[tuple[int, bytes]]]:
+    """Times and payloads by topic, in the order of the log."""
+    found: dict[str, list[tuple[int, bytes]]] = {}
+    for name, topic in scan(path, lambda _: Keep.ALL).topics.items():
+        rows = [(r, p) for stack in topic.stacks.values() for rows, ps in stack for r, p in zip(rows, ps, strict=True)]
+        found[name] = [
+            (int(topic.log_times_ns[row]), payload.tobytes()) for row, payload in sorted(rows, key=lambda x: x[0])
+        ]
+    return found
+
+
+@pytest.mark.parametrize("is_listed", [True, False])
+def test_a_folder_is_the_single_file(whole, folder, is_listed):
+    if is_listed:
+        with_metadata(folder)
+    assert [part.name for part in log_parts(folder)] == NAMES
+    assert contents(folder) == contents(whole)
+    one, several = read_log(whole), read_log(folder)
+    assert several.calibration == one.calibration
+    assert several.name == one.name
+    assert {k: v for k, v in several.notes.items() if k != "log.skipped"} == {
+        k: v for k, v in one.notes.items() if k != "log.skipped"
+    }
+    for role, block in one.blocks().items():
+        for name, column in vars(block).items():
+            np.testing.assert_array_equal(getattr(getattr(several, role), name), column)
+    np.testing.assert_array_equal(several.truth.positions, one.truth.positions)
+    told, expected = inspect_log(folder), inspect_log(whole)
+    assert (told.topics, told.damage, told.warnings) == (expected.topics, expected.damage, expected.warnings)
+    assert list(recorded_messages(folder)) == list(recorded_messages(whole))
+
+
+def test_a_part_of_the_time_is_counted_from_the_first_file(whole, folder):
+    for window in (TimeWindow.parse("5", "12.5"), TimeWindow(Instant(seconds=14.0))):
+        one, several = (scan(path, lambda _: Keep.ALL, window) for path in (whole, folder))
+        assert several.part == one.part or "of the recording" in several.part
+        assert {n: len(t) for n, t in several.topics.items()} == {n: len(t) for n, t in one.topics.items()}
+    with pytest.raises(LogError, match=r"dive: nothing was recorded from"):
+        scan(folder, lambda _: Keep.ALL, TimeWindow.parse("50", None))
+
+
+def test_streaming_and_amending_take_a_folder_too(whole, folder, tmp_path):
+    counts: dict[str, int] = {}
+    for piece in stream(folder, lambda _: Keep.ALL):
+        counts[piece.name] = counts.get(piece.name, 0) + len(piece)
+    assert counts == {name: len(rows) for name, rows in contents(whole).items()}
+    write_amended(folder, tmp_path / "copy.mcap", [])
+    assert contents(tmp_path / "copy.mcap") == contents(whole)
+    assert read_log(tmp_path / "copy.mcap").calibration == read_log(whole).calibration
+
+
+def cut(path: Path) -> None:
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 3])
+
+
+FAULTS = {
+    "missing": (lambda path: path.unlink(), r"dive is damaged: dive_4\.mcap: is missing"),
+    "empty": (lambda path: path.write_bytes(b""), r"dive is damaged: dive_4\.mcap: is not an MCAP file but empty"),
+    "cut": (cut, r"dive is damaged: dive_4\.mcap: bytes \d+ to \d+: the file is cut off"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_part_that_is_missing_or_damaged_is_named_and_the_rest_is_read_if_asked_for(folder, fault):
+    with_metadata(folder)
+    spoil, said = FAULTS[fault]
+    spoil(folder / NAMES[4])
+    with pytest.raises(LogError, match=said):
+        read_log(folder)
+    with pytest.raises(LogError, match=said):
+        list(stream(folder, lambda _: Keep.ALL))
+    assert any(NAMES[4] in line for line in inspect_log(folder).damage)
+    found = read_log(folder, salvage=True)
+    assert NAMES[4] in found.notes["log.damage"]
+    assert 850 < len(found.imu) < 1001
+    assert found.imu.stamps_ns[-1] == small_world().imu.stamps_ns[-1]
+
+
+def test_a_last_part_that_is_cut_off_is_read_as_far_as_it_goes(folder):
+    cut(folder / NAMES[-1])
+    found = read_log(folder)
+    assert "cut off" in found.notes["log.ending"]
+    assert "log.damage" not in found.notes
+
+
+def test_other_folders_are_refused_with_what_to_do(folder, tmp_path):
+    with_metadata(folder, storage="sqlite3")
+    with pytest.raises(LogError, match=r"dive: is a ROS 2 bag of the sqlite3 kind; `sonar-graph convert rosbag"):
+        read_log(folder)
+    with_metadata(folder, ["dive_0.mcap.zstd"])
+    with pytest.raises(LogError, match=r"dive_0\.mcap\.zstd is no \.mcap file; unpack"):
+        read_log(folder)
+    (folder / "metadata.yaml").write_text("nothing: here\n")
+    with pytest.raises(LogError, match=r"metadata\.yaml: names no files under relative_file_paths; `ros2 bag reindex`"):
+        read_log(folder)
+    (folder / "metadata.yaml").unlink()
+    (folder / "other.mcap").write_bytes((folder / NAMES[3]).read_bytes())
+    with pytest.raises(
+        LogError, match=r"dive: (other|dive_3)\.mcap begins before (dive_3|other)\.mcap ends: these are two"
+    ):
+        read_log(folder)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(LogError, match=r"empty: is a folder without metadata\.yaml and \.mcap files"):
+        read_log(tmp_path / "empty")

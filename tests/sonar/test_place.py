@@ -1,0 +1,136 @@
+"""Laws of the place of a landmark: least squares of its figure with the side and the shadow of its relief."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
+from sonar_graph.images import SonarFrames
+from sonar_graph.measurements import Floats
+from sonar_graph.simulation.sonar_image import FrameSimulator, ImageOptions, place_landmark
+from sonar_graph.sonar.appearance import AppearanceParams, CandidateFit
+from sonar_graph.sonar.confusion import confusion_for
+from sonar_graph.sonar.geometry import FloorView
+from sonar_graph.sonar.place import Relief
+
+from .polar_images import candidates_at
+
+CELL_M, SIDE, BLUR_M = 0.015, 37, (0.008, 0.01)
+SIDE_M, SHADOW_CELLS = 0.007, 1.8
+ROWS_COLUMNS = tuple(np.indices((SIDE, SIDE)).reshape(2, -1))
+RELIEF = Relief.of(DEFAULT_DESIGNS[2], 0.3, SIDE, CELL_M, BLUR_M)
+
+
+def columns(relief: Relief = RELIEF) -> list[Floats]:
+    """B with its side, D where no shadow lies on it, and S, written out."""
+    k = SHADOW_CELLS * 2
+    shade = relief.shades[int(k)] * (1 - k % 1) + relief.shades[int(k) + 1] * (k % 1)
+    return [relief.figure + SIDE_M * relief.side, relief.dark * (1 - shade), shade]
+
+
+def patch_with(levels: tuple[float, float, float, float], at: tuple[int, int], noise_db: float, seed: int) -> Floats:
+    """Levels (floor, beta, delta, gamma) of the figure at a cell of a patch of 47 by 47, with white noise."""
+    patch = np.full((47, 47), levels[0]) + np.random.default_rng(seed).normal(0, noise_db, (47, 47))
+    for level, column in zip(levels[1:], columns(), strict=True):
+        patch[at[0] : at[0] + SIDE, at[1] : at[1] + SIDE] += level * column
+    return patch.astype(np.float32)
+
+
+def place_in(patch: Floats, start: tuple[float, float], seen: Floats | None = None) -> tuple[Floats, Floats]:
+    held = np.ones_like(patch) if seen is None else seen
+    return RELIEF.place(patch, held, ROWS_COLUMNS, np.array(start), SIDE_M, SHADOW_CELLS)
+
+
+@pytest.mark.parametrize("off", [(0.0, 0.0), (0.4, -0.3), (-0.45, 0.45)])
+def test_a_figure_with_side_and_shadow_is_placed_where_it_is(off):
+    place, bound = place_in(patch_with((40, 0.7, 0.5, -9.0), (5, 6), 0.01, 1), (5 + off[0], 6 + off[1]))
+    np.testing.assert_allclose(place, (5, 6), atol=2e-3)
+    assert (bound < 1e-3).all()
+
+
+def test_place_and_bound_are_those_of_least_squares_over_the_cells_in_view():
+    """By `scipy.optimize.least_squares` on the same tangents."""
+    patch, (x, y) = patch_with((40, 0.7, 0.5, -9.0), (5, 6), 3.0, 2), (5, 6)
+    seen = np.ones((47, 47), np.float32)
+    seen[:, 33:] = 0
+    place, bound = place_in(patch, (x, y), seen)
+    held = seen[x : x + SIDE, y : y + SIDE] > 0
+    z = patch[x : x + SIDE, y : y + SIDE][held].astype(float)
+    parts = columns()
+    slopes = [np.gradient(part) for part in parts]
+
+    def residuals(q: Floats) -> Floats:
+        floor, *levels, dx, dy = q
+        shifted = [c - dx * s[0] - dy * s[1] for c, s in zip(parts, slopes, strict=True)]
+        return z - floor - sum(level * part for level, part in zip(levels, shifted, strict=True))[held]
+
+    found = least_squares(residuals, [40, 1, 0.3, -5, 0, 0])
+    np.testing.assert_allclose(place - (x, y), found.x[4:], atol=0.02)
+    mean_square = np.mean(found.fun**2)
+    expected = np.sqrt(mean_square * np.diag(np.linalg.inv(found.jac.T @ found.jac))[4:])
+    np.testing.assert_allclose(bound, expected, rtol=0.03)
+
+
+def test_a_shadow_alone_tells_the_place_from_the_next_cell():
+    place, _ = place_in(patch_with((40, 0.06, 0.0, -15.0), (5, 6), 0.01, 1), (5.6, 6.0))
+    np.testing.assert_allclose(place, (5, 6), atol=0.25)
+
+
+def test_the_side_brightens_the_near_part_of_the_face_and_nothing_else():
+    """By most of Lambert's 7.9 dB where it is drawn, which blurs into the cells beside it."""
+    lift_db = SIDE_M * RELIEF.side
+    rows, _ = np.nonzero(lift_db > 1.0)
+    assert lift_db.max() > 3.0
+    assert lift_db.min() > -0.1
+    assert rows.max() < np.nonzero(RELIEF.figure > 6.0)[0].max() - 5
+
+
+@pytest.mark.parametrize("noise_db", [2.0, 6.0])
+def test_white_noise_moves_a_place_by_its_bound(noise_db: float):
+    places, bounds = zip(
+        *(place_in(patch_with((40, 0.7, 0.5, -9.0), (5, 6), noise_db, k), (5.3, 5.8)) for k in range(300)), strict=True
+    )
+    share = np.std(places, axis=0) / np.sqrt(np.mean(np.square(bounds), axis=0))
+    assert (share > 0.85).all()
+    assert (share < 1.15).all()
+
+
+@pytest.mark.parametrize("floor_db", [-60.0, 0.0, 90.0])
+def test_no_gain_moves_a_place(floor_db: float):
+    plain, other = (place_in(patch_with((db, 0.7, 0.5, -9.0), (5, 6), 4.0, 3), (5, 6)) for db in (40.0, floor_db))
+    np.testing.assert_allclose(other, plain, atol=2e-3)
+
+
+def test_nothing_in_view_has_no_bound_and_does_not_move():
+    place, bound = place_in(np.zeros((47, 47), np.float32), (5, 6), np.zeros((47, 47), np.float32))
+    np.testing.assert_array_equal(place, (5, 6))
+    assert np.isinf(bound).all()
+
+
+def range_errors_m(design: LandmarkDesign, believed: LandmarkDesign) -> Floats:
+    """Of a landmark ahead in frames of the simulator, which knows no templates, at several headings."""
+    model = confusion_for(DEFAULT_DESIGNS).model_copy(update={"height_bias_m": 0.0})
+    sonar_m, tilt = np.array([0.0, 0.0, 0.95]), Rotation.from_euler("ZYX", [0, 30, 0], degrees=True)
+    centre_m = np.array([1.7, 0.0, design.height_m])
+    x, y, z = tilt.inv().apply(centre_m - sonar_m)
+    r, a = float(np.sqrt(x**2 + y**2 + z**2)), float(np.arctan2(y, x))
+    errors = []
+    for seed, heading in enumerate(np.linspace(0, 2.0, 8)):
+        simulator = FrameSimulator(ImageOptions(), [place_landmark(design, centre_m, heading, 0.0)], 0.0, seed)
+        level_db = simulator.level_db(sonar_m, tilt, 0, 1.7)
+        frame = SonarFrames(np.array([1]), level_db[None], simulator.ranges_m(), simulator.azimuths_rad())
+        look = CandidateFit([believed], AppearanceParams(), model, np.radians(14))
+        view = FloorView(tilt.as_matrix(), 0.95 - design.height_m)
+        (seen,) = look.at(level_db, frame, view, candidates_at([r], [a]), np.array([0]))
+        errors.append(seen.range_m - r)
+    return np.array(errors)
+
+
+def test_foam_that_stands_up_is_ranged_without_bias_and_nearer_where_its_relief_is_not_known():
+    disc = DEFAULT_DESIGNS[0]
+    known, unknown = (range_errors_m(disc, one) for one in (disc, replace(disc, relief_m=0.0)))
+    assert abs(known.mean()) < 0.002
+    assert unknown.mean() < known.mean() - 0.003

@@ -1,0 +1,162 @@
+"""Laws of sightings: where candidates are, how certain that is, and what the designs say of them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS
+from sonar_graph.images import SonarFrames
+from sonar_graph.measurements import Floats
+from sonar_graph.sonar.appearance import (
+    CENTROID_SIGMA_M,
+    AppearanceParams,
+    CandidateFit,
+    DesignFit,
+    ObjectSighting,
+)
+from sonar_graph.sonar.confusion import Confusion, confusion_for
+from sonar_graph.sonar.geometry import FloorView
+
+from .polar_images import AZIMUTHS_RAD, HEIGHT_M, RANGES_M, ROTATION, VIEW, candidates_at, image_db, polar
+
+APERTURE_RAD = 0.244
+USUAL = {"range_bound_m": 1e-3, "across_bound_m": 1.2e-3, "bound_power": 1.5}
+SETTINGS = {"height_bias_m": 0.0, "range_sigma_m": 0.01, "across_sigma_m": 0.008} | USUAL
+MODEL = confusion_for(DEFAULT_DESIGNS).model_copy(update=SETTINGS)
+TRIANGLE = 2
+FLUSH = [replace(design, relief_m=0.0) for design in DEFAULT_DESIGNS]
+"""As these images show them: what stands up has a bright side and a shadow."""
+
+
+def odds(fit: DesignFit, model: Confusion = MODEL) -> Floats:
+    """Of each design against none of them, by one look."""
+    return model.log_odds(fit.evidence)
+
+
+def frame(image: Floats, ranges_m: Floats = RANGES_M, azimuths_rad: Floats = AZIMUTHS_RAD) -> SonarFrames:
+    return SonarFrames(np.array([1]), image[None], ranges_m, azimuths_rad)
+
+
+def look_at(
+    image: Floats,
+    near_m: tuple[float, float],
+    model: Confusion = MODEL,
+    view: FloorView | None = VIEW,
+    aperture_rad: float = APERTURE_RAD,
+) -> ObjectSighting:
+    """A look at a candidate near a point of the floor."""
+    r, a = polar(near_m)
+    look = CandidateFit(FLUSH, AppearanceParams(), model, aperture_rad)
+    return look.at(image, frame(image), view, candidates_at([r], [a]), np.array([0]))[0]
+
+
+@pytest.fixture(scope="module")
+def triangle() -> np.ndarray:
+    return image_db(DEFAULT_DESIGNS[TRIANGLE], (1.7, 0.05), 0.5, ROTATION, np.random.default_rng(0))
+
+
+def test_range_and_azimuth_are_those_of_the_centre_and_as_certain_as_the_fit(triangle):
+    found = look_at(triangle, (1.725, 0.03))
+    r, a = polar((1.7, 0.05))
+    assert odds(found.fit).argmax() == TRIANGLE
+    assert (found.range_m, found.azimuth_rad) == (pytest.approx(r, abs=0.006), pytest.approx(a, abs=0.004))
+    sigmas = np.array([0.01, 0.008 / found.range_m]) * (found.bound_m / [1e-3, 1.2e-3]) ** 1.5
+    np.testing.assert_allclose(found.covariance, np.diag(sigmas**2))
+
+
+def test_a_fit_tells_no_less_than_the_centroid_of_its_candidate(triangle):
+    blind = MODEL.model_copy(update={"range_sigma_m": 9.0, "across_sigma_m": 19.0})
+    found = look_at(triangle, (1.725, 0.03), blind)
+    sigmas = CENTROID_SIGMA_M, CENTROID_SIGMA_M / polar((1.725, 0.03))[0]
+    np.testing.assert_allclose(found.covariance, np.diag(np.square(sigmas)))
+
+
+def test_a_face_that_is_higher_than_the_landmarks_place_seems_nearer_by_what_is_added(triangle):
+    high = MODEL.model_copy(update={"height_bias_m": 0.02})
+    plain, found = (look_at(triangle, (1.7, 0.05), model) for model in (MODEL, high))
+    assert found.range_m - plain.range_m == pytest.approx(0.02 * HEIGHT_M / plain.range_m, rel=1e-6)
+    assert look_at(triangle, (1.7, 0.05), high, view=None).range_per_height == 0.0
+
+
+@pytest.mark.parametrize(
+    ("near_m", "view", "aperture_rad"),
+    [
+        ((1.7, 0.75), VIEW, APERTURE_RAD),  # hardly in the image
+        ((0.9, 0.0), FloorView(ROTATION, 2.0), APERTURE_RAD),  # no ray meets the floor there
+        ((1.95, 0.05), VIEW, 0.05),  # a fan of a fifth of the opening shows a strip of it
+    ],
+)
+def test_what_is_not_in_view_is_compared_with_nothing(triangle, near_m, view, aperture_rad):
+    found = look_at(triangle, near_m, view=view, aperture_rad=aperture_rad)
+    assert found.fit is None
+    r, a = polar(near_m)
+    assert (found.range_m, found.azimuth_rad) == (r, a)
+    np.testing.assert_allclose(found.covariance, np.diag([CENTROID_SIGMA_M**2, (CENTROID_SIGMA_M / r) ** 2]))
+
+
+def test_rows_say_which_candidate_and_odds_are_those_of_the_model(triangle):
+    r, a = polar((1.7, 0.05))
+    look = CandidateFit(FLUSH, AppearanceParams(), MODEL, APERTURE_RAD)
+    candidates = candidates_at([2.05, r], [-0.1, a])
+    none, seen, beside = look.at(triangle, frame(triangle), VIEW, candidates, np.array([-1, 1, 0]))
+    assert none is None
+    assert beside.azimuth_rad == pytest.approx(-0.1, abs=0.05)
+    found = look.log_odds([none, seen, beside])
+    assert np.isnan(found[0]).all()
+    np.testing.assert_allclose(found[1], [*MODEL.log_odds(seen.fit.evidence), 0.0])
+    assert found[1].argmax() == TRIANGLE
+
+
+def test_candidates_of_one_frame_are_seen_as_each_alone(triangle):
+    """Of three the middle one is not in view, and its row of the others is not the frame's."""
+    places = [polar(xy) for xy in ((1.7, 0.07), (1.7, 0.75), (1.69, 0.04))]
+    look = CandidateFit(FLUSH, AppearanceParams(), MODEL.model_copy(update={"height_bias_m": 0.02}), APERTURE_RAD)
+
+    def seen(*of: tuple[float, float]) -> list[ObjectSighting]:
+        return look.at(
+            triangle, frame(triangle), VIEW, candidates_at(*map(list, zip(*of, strict=True))), np.arange(len(of))
+        )
+
+    for one, (other,) in zip(seen(*places), map(seen, places), strict=True):
+        assert (one.fit is None) == (other.fit is None)
+        assert (one.range_m, one.azimuth_rad, one.range_per_height) == pytest.approx(
+            (other.range_m, other.azimuth_rad, other.range_per_height), rel=1e-12
+        )
+        np.testing.assert_array_equal(one.covariance, other.covariance)
+
+
+def test_other_beams_and_bins_are_looked_up_anew(triangle):
+    """A log may change its window on the way: beams the other way round, fewer bins, farther bins."""
+    look, (r, a) = CandidateFit(FLUSH, AppearanceParams(), MODEL, APERTURE_RAD), polar((1.7, 0.05))
+    first, turned, fewer, farther = (
+        look.at(image, frame(image, *window), VIEW, candidates_at([r], [a]), np.array([0]))[0].fit.evidence
+        for image, *window in (
+            (triangle, RANGES_M, AZIMUTHS_RAD),
+            (np.ascontiguousarray(triangle[::-1]), RANGES_M, AZIMUTHS_RAD[::-1].copy()),
+            (np.ascontiguousarray(triangle[:, :400]), RANGES_M[:400], AZIMUTHS_RAD),
+            (triangle, RANGES_M + 0.1, AZIMUTHS_RAD),
+        )
+    )
+    np.testing.assert_allclose([turned, fewer], [first, first], atol=5e-3)
+    assert abs(farther - first).max() > 0.05
+
+
+def test_without_a_floor_the_patch_lies_in_the_plane_of_the_image():
+    """A design drawn in that plane is found; on the floor's grid it would be foreshortened."""
+    r, a = np.meshgrid(RANGES_M, AZIMUTHS_RAD)
+    level = np.nan_to_num(DEFAULT_DESIGNS[1].level_db(r * np.cos(a) - 1.9, r * np.sin(a) - 0.1)) + 35.0
+    image = (level + 10 * np.log10(np.random.default_rng(3).exponential(size=level.shape))).astype(np.float32)
+    r, a = np.hypot(1.9, 0.1), np.arctan2(0.1, 1.9)
+    candidate, look = candidates_at([r], [a]), CandidateFit(FLUSH, AppearanceParams(), MODEL, APERTURE_RAD)
+    flat, tilted = (look.at(image, frame(image), view, candidate, np.array([0]))[0] for view in (None, VIEW))
+    assert odds(flat.fit).argmax() == 1
+    assert (flat.range_m, flat.azimuth_rad) == (pytest.approx(r, abs=0.006), pytest.approx(a, abs=0.003))
+    assert tilted.fit is None or odds(tilted.fit)[1] < odds(flat.fit)[1] - 1
+
+
+def test_what_a_template_lacks_is_millimetres_across_at_any_range():
+    bound_m, range_m = np.array([[1e-3, 2e-3]] * 2), np.array([2.0, 8.0])
+    near, far = MODEL.range_azimuth_cov(bound_m, range_m)
+    np.testing.assert_allclose(near[0, 0], far[0, 0])
+    np.testing.assert_allclose(2.0 * np.sqrt(near[1, 1]), 8.0 * np.sqrt(far[1, 1]))
