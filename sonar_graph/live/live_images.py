@@ -27,6 +27,9 @@ ROLES = ("imu", "dvl", "depth")
 UNREADABLE = "no sonar image"
 ENDED, FAILED = "not recognised: the run ended", "not recognised: recognition failed"
 TOO_EARLY = "not recognised: of the first seconds, which give the calibration and the templates"
+IN_PLANE = "landmarks are compared in the plane of the image, where they look less like their designs"
+NO_HEIGHT = f"the height of the floor is not known: {IN_PLANE}; state [floor] z_m and sigma_m in a --calibration file"
+NO_DEPTH = f"no depth comes: the height over the floor is not known, and {IN_PLANE}"
 
 
 class LiveImages:
@@ -136,6 +139,10 @@ class LiveImages:
             self._topic, self._adapter = choice.topic, choice.adapter
             if missed := engine.counts.received[self._topic] - (message.topic == self._topic):
                 engine.counts.dropped[self._topic, TOO_EARLY] += missed
+            assert engine.calibration is not None
+            lacks = NO_HEIGHT if engine.calibration.floor is None else "" if "depth" in engine.in_use else NO_DEPTH
+            if lacks:
+                engine.remarks.append(f"warning: {self._topic}: {lacks}")
 
     def _read(self, message: Message) -> None:
         topic = self._engine.topics[self._topic].empty()

@@ -28,11 +28,11 @@ import numpy as np
 from pydantic import Field
 from scipy.optimize import linear_sum_assignment
 from scipy.special import ndtr
-from scipy.stats import chi2
 
 from sonar_graph.calibration import Section
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Floats, Ints
+from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.sonar.geometry import point_covariances, points
 from sonar_graph.sonar.regions import Candidates
 
@@ -215,7 +215,7 @@ class Tracker:
     def __init__(self, params: TrackingParams | None = None) -> None:
         self.params = params or TrackingParams()
         self._noise = np.diag([self.params.range_sigma_m**2, self.params.azimuth_sigma_rad**2])
-        self._gate = float(chi2.ppf(self.params.gate_probability, 2))
+        self._gate = chi_square_quantile(self.params.gate_probability, 2)
         self._tracks = TrackStates.none()
         self._skipped: SonarStep | None = None
         self._stamp_ns: int | None = None
