@@ -232,7 +232,7 @@ def main() -> int:
     parser.add_argument("--interrupts", type=int, help="number of interrupted comparisons (default: 30)")
     parser.add_argument("--seed", type=int, default=0, help="of the cases (default: 0)")
     options = parser.parse_args()
-    count = options.cases if options.cases is not None else 48 if options.quick else 600
+    count = options.cases if options.cases is not None else 32 if options.quick else 600
     interrupted = options.interrupts if options.interrupts is not None else 2 if options.quick else 30
     totals, by_kind, rss_mb = Counter[str](), defaultdict[str, Counter[str]](Counter), 0.0
     with tempfile.TemporaryDirectory() as scratch:

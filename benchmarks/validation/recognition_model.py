@@ -177,7 +177,7 @@ def main() -> None:
         "basins": ", ".join(map(str, chosen)),
     }
     model = estimate_confusion(together(parts).fits(), IDS, provenance, DEFAULT_DESIGNS)
-    plain = in_parallel(sightings_of, list(ACCURACY)[: 1 if arguments.quick else None], arguments.workers, "accuracy")
+    plain = in_parallel(sightings_of, [] if arguments.quick else list(ACCURACY), arguments.workers, "accuracy")
     true = [part for seed, part in zip(chosen, parts, strict=True) if conditions_of(seed).get("foam_height_m") != 0]
     of_true = estimate_confusion(together(true + plain).fits(), IDS, {}, DEFAULT_DESIGNS)
     accurate = {n: getattr(of_true, n) for n in SIGMAS} | {"height_bias_m": 0.0}
