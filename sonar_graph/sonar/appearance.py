@@ -25,7 +25,7 @@ from sonar_graph.sonar.evidence import Figures
 from sonar_graph.sonar.geometry import FloorView
 from sonar_graph.sonar.place import Relief
 from sonar_graph.sonar.regions import Candidates
-from sonar_graph.sonar.templates import BLUR_RATIO, Blur, Floats32, Patch, PolarGrid, Templates
+from sonar_graph.sonar.templates import ASSUMED_SLOPE, BLUR_RATIO, Blur, Floats32, Patch, PolarGrid, Templates
 
 COARSE = 2
 """Cells between the places from which the search climbs to the best one."""
@@ -53,7 +53,7 @@ class DesignFit:
     """Fit of each design to a patch."""
 
     evidence: Floats
-    """What speaks for each design, in the columns of `sonar_graph.sonar.evidence.EVIDENCE`, shape (designs, 9)."""
+    """What speaks for each design, in the columns of `sonar_graph.sonar.evidence.EVIDENCE`, shape (designs, 11)."""
     visible: float
     """Share of the cells in view at the best fit of all."""
     heading_rad: Floats
@@ -262,8 +262,6 @@ CENTROID_SIGMA_M = 0.04
 """Standard deviation of a candidate's centroid from the landmark's centre, along and across; used without a fit."""
 SLANT_PLANE = FloorView(np.eye(3), 1e-3)
 """Plane of the image, which holds the patches where no floor is known."""
-ASSUMED_SLOPE = math.tan(math.radians(30.0))
-"""Of the ray to such a patch against the floor that is not known."""
 
 
 @dataclass(frozen=True, eq=False)

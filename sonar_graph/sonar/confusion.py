@@ -144,7 +144,7 @@ class Confusion(Section):
         return np.array(self.matrix)
 
     def log_odds(self, evidence: Floats) -> Floats:
-        """Log odds of each design against none of them, shape (..., designs), from evidence (..., designs, 9)."""
+        """Log odds of each design against none of them, shape (..., designs), from evidence (..., designs, 11)."""
         return np.asarray(evidence @ np.array(self.weights))
 
     def range_azimuth_cov(self, bound_m: Floats, range_m: Floats) -> Floats:

@@ -6,11 +6,14 @@ shade, and e the residual::
 
     design      z = floor + beta B + delta D + gamma S + e        delta <= 0, gamma <= 0
     otherwise   z = floor + beta B_q + gamma S_q + e              gamma <= 0, the best q
+    covered     z = floor + beta B H + delta D + e                the best H, or 1
 
-No level is given, so that neither gain nor contrast nor a plate that cannot be seen makes a fit bad. R is the sum of
-squares that a model leaves, and sigma^2 the mean square of `design` without S. `EVIDENCE` names what comes of it, the
-columns of `Figures.evidence`. How much each counts is measured (`Confusion.weights`). Derivation:
-docs/theory/recognition.md.
+H is 1 on one side of a straight edge and 0 beyond it, where sediment or weed lies: `EDGES` directions, `OFFSETS` from
+the middle. No level is given, so that neither gain nor contrast nor a plate that cannot be seen makes a fit bad. R is
+the sum of squares that a model leaves, and sigma^2 the mean square of `design` without S. `EVIDENCE` names what comes
+of it, the columns of `Figures.evidence`. Of Gaussian e a likelihood ratio is ``n / 2 ln R' / R`` with n independent
+cells: logarithms of ratios count by the share of cells that are independent. How much each column counts is measured
+(`Confusion.weights`). Derivation: docs/theory/recognition.md.
 """
 
 from __future__ import annotations
@@ -29,16 +32,25 @@ from sonar_graph.numerics import compiled
 from sonar_graph.sonar.templates import Blur, Floats32, Patch, Templates, drawn, material_radius_m
 
 Bools = NDArray[np.bool_]
-EVIDENCE = ("prior", "outline", "figure", "contrast", "beyond", "floor", "behind", "plate", "bare")
+EVIDENCE = ("prior", "outline", "figure", "contrast", "beyond", "floor", "behind", "plate", "bare", "rival", "covered")
 """prior: 1; outline: ln R(otherwise) / R(design); figure: the same without S and D; contrast: ln beta / sigma; beyond:
 ln mean square of what is brighter than the design says, next to the figure; floor: ln mean square of what is darker,
-farther out; behind: level next to the figure on its far side, dB; plate: root of ln R(without D) / R(design); bare: 1
-for a design without dark parts, which no plate can speak for."""
+farther out; behind: level next to the figure on its far side, dB; plate: root of ln R(without D) / R(design), or of ln
+R(without B) / R(design) where that is less, since a plate alone is none; bare: 1 for a design without dark parts, which
+no plate can speak for; rival: ln of the least R(covered) of all designs over that of this one, as shares of what one
+level leaves; covered: ln R(design without S) / R(covered)."""
+RATIOS = [EVIDENCE.index(name) for name in ("outline", "figure", "rival", "covered")]
+"""Columns that are logarithms of ratios of two R, and so count by the number of independent cells."""
+HALF_POWER = 2 * math.sqrt(2 * math.log(2))
+"""Width at half of the power over the standard deviation."""
 STRETCHES = (
     *((1.0, 1.0), (0.78, 0.78), (0.87, 0.87), (0.94, 0.94), (1.07, 1.07), (1.15, 1.15), (1.27, 1.27)),
     *((1.2, 0.83), (0.83, 1.2)),
 )
 """Of the figures of what is no landmark, along the design's axes x and y; the first is the design's own."""
+EDGES, OFFSETS = 12, (0.15, 0.4, 0.65)
+"""Edges of what covers a part of a figure: directions, and distances from its middle, in radii of the disc that has the
+figure's second moment."""
 REACH_M = 0.06
 """Width of the ring around the largest design that is explained."""
 SHADOW_M = 0.09
@@ -78,6 +90,10 @@ class Figures(NamedTuple):
     """``values^T values`` of each template, shape (templates, 2 + 2 figures, 2 + 2 figures)."""
     has_dark: Bools
     """Whether it has dark parts, shape (templates,)."""
+    strips: NDArray[np.uint8]
+    """Number of edges of each direction that a cell lies beyond, shape (n, EDGES)."""
+    independent: float
+    """Share of the cells that are independent: cells are not where the sonar resolves less."""
 
     @classmethod
     def of(cls, designs: Sequence[LandmarkDesign], templates: Templates, blur_m: Blur, last: int) -> Figures:
@@ -89,6 +105,8 @@ class Figures(NamedTuple):
         away_m = np.hypot(x_m, y_m)
         area = (away_m <= material_m + REACH_M) | ((away_m <= material_m + SHADOW_M) & (x_m > 0.5 * away_m))
         kernel = np.ones((2 * NEAR_CELLS + 1, 2 * NEAR_CELLS + 1), np.uint8)
+        towards = 2 * math.pi * np.arange(EDGES) / EDGES
+        beyond_m = x_m[:, :, None] * np.cos(towards) + y_m[:, :, None] * np.sin(towards)
         columns = []
         for index, heading in zip(templates.design.tolist(), templates.heading_rad.tolist(), strict=True):
             design = designs[index]
@@ -107,23 +125,30 @@ class Figures(NamedTuple):
             smooth = np.stack([cv2.blur(dark, (3, 3)), cv2.blur(figure, (3, 3))])[:, compared].T.astype(np.float32)
             gram = values.T.astype(float) @ values
             x, y = np.nonzero(compared)
-            columns.append((x * (side + last) + y, values, smooth, zones[compared], gram, has_dark))
+            strips = (beyond_m[compared] > radius_m(figure, away_m) * np.array(OFFSETS)[:, None, None]).sum(axis=0)
+            own = x * (side + last) + y, values, smooth, zones[compared], strips.astype(np.uint8)
+            columns.append((*own, gram, has_dark))
         *rows, grams, darks = zip(*columns, strict=True)
         first = np.cumsum([0, *map(len, rows[0])])
-        cells, values, smooth, zones = (np.ascontiguousarray(np.concatenate(of)) for of in rows)
-        return cls(side + last, first, cells, values, smooth, zones, np.array(grams), np.array(darks))
+        cells, values, smooth, zones, strips = (np.ascontiguousarray(np.concatenate(of)) for of in rows)
+        independent = math.prod(min(cell_m / (HALF_POWER * blur), 1.0) for blur in blur_m)
+        return cls(
+            side + last, first, cells, values, smooth, zones, np.array(grams), np.array(darks), strips, independent
+        )
 
     def evidence(self, patch: Patch, template: Ints, cell: Ints) -> Floats | None:
-        """`EVIDENCE` of templates on the parts of a patch that begin at some cells, shapes (n,), (n, 2), (n, 9).
+        """`EVIDENCE` of templates on the parts of a patch that begin at some cells, shapes (n,), (n, 2), (n, 11).
 
         None where too little of one is in view, or where it has one level.
         """
         found = np.empty((len(template), len(EVIDENCE)))
         is_measured = fill_evidence(
             patch.level_db.ravel(), patch.seen.ravel(), patch.smooth_db.ravel(), patch.held.ravel(), self.patch_side,
-            self.first, self.cells, self.values, self.smooth, self.zones, self.gram, self.has_dark,
+            self.first, self.cells, self.values, self.smooth, self.zones, self.gram, self.has_dark, self.strips,
             template, cell, found,
         )  # fmt: skip
+        found[:, RATIOS] *= self.independent
+        found[:, EVIDENCE.index("plate")] *= math.sqrt(self.independent)
         return found if is_measured else None
 
 
@@ -131,13 +156,14 @@ class Figures(NamedTuple):
 def fill_evidence(
     level_db: Floats32, seen: Floats32, smooth_db: Floats32, held: Floats32, side: int,
     first_of: Ints, all_cells: Ints, all_values: Floats32, all_smooth: Floats32, all_zones: Ints, grams: Floats,
-    has_dark: Bools, template: Ints, cell: Ints, found: Floats,
+    has_dark: Bools, all_strips: NDArray[np.uint8], template: Ints, cell: Ints, found: Floats,
 ) -> bool:  # fmt: skip
-    """Fill in `EVIDENCE` of templates on the parts of a patch that begin at some cells, shape (n, 9).
+    """Fill in `EVIDENCE` of templates on the parts of a patch that begin at some cells, shape (n, 11).
 
     A patch comes row by row, each ``side`` cells; what is known of templates as in `Figures`. False where too little is
     in view, or where it has one level.
     """
+    least = np.inf
     for k in range(len(template)):
         begin, end, shift = first_of[template[k]], first_of[template[k] + 1], cell[k, 0] * side + cell[k, 1]
         cells, values, rows = all_cells[begin:end], all_values[begin:end], end - begin
@@ -169,6 +195,8 @@ def fill_evidence(
             with_dark, _ = least_squares(gram, products, total, np.array([0, first, dark]), c)
             if c[2] < 0:
                 design, floor, beta, delta = with_dark, c[0], c[1], c[2]
+        dz = products[dark] - gram[0, dark] / count * products[0]
+        only_dark = total - (dz**2 / (gram[dark, dark] - gram[0, dark] ** 2 / count) if delta < 0 else 0.0)
         shaded, _ = least_squares(gram, products, total, np.array([0, first, first + kinds]), c)
         shaded = shaded if c[2] < 0 else plain
         both = min(design, shaded)
@@ -202,9 +230,54 @@ def fill_evidence(
         found[k, 4] = math.log((near / near_cells if near_cells > 8 else mean_square / 3) + LEAST_DB2)
         found[k, 5] = math.log((far / far_cells if far_cells > 8 else mean_square / 3) + LEAST_DB2)
         found[k, 6] = back / back_cells if back_cells > 5 else 0.0
-        found[k, 7] = math.sqrt(max(math.log(shaded / both), 0.0))
+        plate, foam = math.log(shaded / both), math.log(max(only_dark, 1e-3) / design)
+        found[k, 7] = math.sqrt(max(min(plate, foam), 0.0)) if delta < 0 else 0.0
         found[k, 8] = 0.0 if has_dark[template[k]] else 1.0
+        covered = least_covered(level[0], is_seen, values, all_strips[begin:end], count, gram, only_dark, dz, delta < 0)
+        covered = min(covered, design)
+        found[k, 9], found[k, 10] = math.log(covered / total), math.log(design / covered)
+        least = min(least, found[k, 9])
+    for k in range(len(template)):
+        found[k, 9] = least - found[k, 9]
     return True
+
+
+@compiled
+def least_covered(
+    level: Floats32, seen: Floats32, values: Floats32, strips: NDArray[np.uint8], count: float, gram: Floats,
+    only_dark: float, dz: float, has_dark: bool,
+) -> float:  # fmt: skip
+    """Least sum of squares that a figure leaves of which all beyond a straight edge is covered, with D or without.
+
+    The floor and D are taken out of the figure first: ``R = R(floor, D) - (b^T z)^2 / b^T b``. ``only_dark`` is
+    R(floor, D), ``dz`` the product of D, without its mean, and z.
+    """
+    edges = strips.shape[1]
+    of_strip = np.zeros((len(OFFSETS) + 1, edges, 4))
+    for n in range(len(level)):
+        b = values[n, 2] * seen[n]
+        if b > OUT:
+            bb, bd, bz = b * b, b * values[n, 1], b * level[n]
+            for e in range(edges):
+                to = of_strip[strips[n, e], e]
+                to[0], to[1], to[2], to[3] = to[0] + b, to[1] + bb, to[2] + bd, to[3] + bz
+    dark_mean, dd, least = gram[0, 1] / count, gram[1, 1] - gram[0, 1] ** 2 / count, only_dark
+    for e in range(edges):
+        kept = np.zeros(4)
+        for strip in range(len(OFFSETS)):
+            kept += of_strip[strip, e]
+            bb, bz = kept[1] - kept[0] ** 2 / count, kept[3]
+            if has_dark:
+                bd = kept[2] - kept[0] * dark_mean
+                bb, bz = bb - bd**2 / dd, bz - bd * dz / dd
+            if bb > 0 and bz > 0:
+                least = min(least, only_dark - bz**2 / bb)
+    return max(least, 1e-3)
+
+
+def radius_m(figure: Floats32, away_m: Floats) -> float:
+    """Radius of the disc that has the second moment of a figure about its middle."""
+    return math.sqrt(2 * float(np.average(away_m**2, weights=np.maximum(figure, 0.0))))
 
 
 @compiled

@@ -21,14 +21,10 @@ import numpy as np
 from sonar_graph.devices import LandmarkDesign
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.numerics import compiled
-from sonar_graph.sonar.templates import FINE, Blur, Floats32, echo_power, seen_db, seen_share
+from sonar_graph.sonar.templates import FINE, Blur, Floats32, echo_power, seen_db, seen_share, with_side
 
-SIDE_DB, SIDE_M = 7.9, 0.006
-"""Level of a face with its side laid over it, over that of the face alone, and the width for which it is drawn.
-
-``1 + (d / h)^3`` by Lambert's law, at a grazing angle of 30 degrees: the side is met more steeply, ``(d / h)^2``, and
-has d / h times the area on the same width.
-"""
+SIDE_M = 0.006
+"""Width of the side for which it is drawn."""
 SHADES, SHADE_FINE = 12, FINE // 2
 """Shadows that are drawn: number, and by how many points of the fine grid each is longer than the one before."""
 STEPS = 2
@@ -53,11 +49,8 @@ class Relief(NamedTuple):
         """A design at this heading against the direction away from the sonar, which is the grid's x axis."""
         of_bright, power = echo_power(design, heading_rad, side, cell_m)
         is_bright = power > 1
-        shaded, inner = is_bright.copy(), is_bright.copy()
-        for _ in range(round(SIDE_M / cell_m * FINE)):
-            inner[1:] &= inner[:-1]
-        with_side = np.where(is_bright & ~inner, power * np.float32(10 ** (SIDE_DB / 10)), power)
-        bright, whole, raised = (seen_db(one, cell_m, blur_m) for one in (of_bright, power, with_side))
+        shaded, raised_power = is_bright.copy(), with_side(power, round(SIDE_M / cell_m * FINE))
+        bright, whole, raised = (seen_db(one, cell_m, blur_m) for one in (of_bright, power, raised_power))
         shades = [np.zeros_like(bright)]
         for _ in range(SHADES):
             for _ in range(SHADE_FINE):

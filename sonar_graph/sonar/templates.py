@@ -32,6 +32,14 @@ HEADINGS = 48
 FINE = 4
 """Points of a cell, along each axis, over which a mask is averaged."""
 LEAST_BLUR_M = 1e-3
+ASSUMED_SLOPE = math.tan(math.radians(30.0))
+"""Of the ray to a landmark against the floor, where it is not known or templates are drawn once for all."""
+SIDE_DB = 7.9
+"""Level of a face with its side laid over it, over that of the face alone.
+
+``1 + (d / h)^3`` by Lambert's law, at a grazing angle of 30 degrees: the side is met more steeply, ``(d / h)^2``, and
+has d / h times the area on the same width.
+"""
 MOST_POWERS = 1024
 """Number of drawings before the blur that are kept, some 80 kB each: those of four designs are 561."""
 SEARCHED_DARK = 0.5
@@ -98,13 +106,25 @@ def drawn(
 ) -> tuple[Floats32, Floats32]:  # fmt: skip
     """Bright and dark parts of a design over the floor, dB, as the sonar sees them, shapes (side, side).
 
-    Stretched along its axes x and y. The beams and the pulse blur the *power* of the echo, so that what is bright grows
-    and what is dark shrinks; a cell is then a mean of decibels. Both parts add up to the whole.
+    Stretched along its axes x and y. The side that its relief shows at `ASSUMED_SLOPE` is laid over the face. The beams
+    and the pulse blur the *power* of the echo, so that what is bright grows and what is dark shrinks; a cell is then a
+    mean of decibels. Both parts add up to the whole.
     """
+    width = round(design.standing_m * ASSUMED_SLOPE / cell_m * FINE)
     bright_db, whole_db = (
-        seen_db(power, cell_m, blur_m) for power in echo_power(design, heading_rad, side, cell_m, stretch)
+        seen_db(with_side(power, width), cell_m, blur_m)
+        for power in echo_power(design, heading_rad, side, cell_m, stretch)
     )
     return bright_db, whole_db - bright_db
+
+
+def with_side(power: Floats32, width: int) -> Floats32:
+    """Power of an echo with the near side of what is bright laid over it, so many fine points wide."""
+    is_bright = power > 1
+    inner = is_bright.copy()
+    for _ in range(width):
+        inner[1:] &= inner[:-1]
+    return np.where(is_bright & ~inner, power * np.float32(10 ** (SIDE_DB / 10)), power)
 
 
 @lru_cache(maxsize=MOST_POWERS)

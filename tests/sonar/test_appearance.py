@@ -24,6 +24,7 @@ from sonar_graph.sonar.templates import (
     azimuth,
     material_radius_m,
 )
+from sonar_graph.sonar.templates import drawn as picture_of
 
 from .polar_images import (
     AZIMUTHS_RAD,
@@ -46,8 +47,8 @@ MODEL = confusion_for(DEFAULT_DESIGNS)
 
 @pytest.fixture(scope="module")
 def appearance() -> Appearance:
-    """For images that are as sharp as these: neither beams nor pulse blur them."""
-    return Appearance(DEFAULT_DESIGNS, BLUR_M)
+    """For images that are as sharp as these, of landmarks as flat: neither beams nor pulse blur them."""
+    return Appearance([replace(design, relief_m=0.0) for design in DEFAULT_DESIGNS], BLUR_M)
 
 
 def _fit(
@@ -60,7 +61,7 @@ def half_plane() -> LandmarkDesign:
     """10 dB of material on the side of positive x."""
     mask = np.full((200, 200), np.nan)
     mask[:, 100:] = 10.0
-    return LandmarkDesign(1, "half", 1.0, mask)
+    return LandmarkDesign(1, "half", 1.0, mask, relief_m=0.0)
 
 
 def places_m(templates: Templates) -> Floats:
@@ -77,6 +78,16 @@ def test_the_power_of_an_edge_is_blurred_by_the_pulse_away_from_the_sonar_and_by
     near = (np.abs(along) < 0.1) & (np.abs(aside) < 0.2)
     power = 1 + 9 * 0.5 * (1 + erf(along[near] / (blur_m * np.sqrt(2))))
     np.testing.assert_allclose(picture[near], 10 * np.log10(power), atol=0.3)
+
+
+def test_foam_that_stands_up_shows_its_near_side_over_the_first_centimetres_of_its_face():
+    """2 cm of foam at a slope of tan 30 degrees: 12 mm of its near edge and their blur are brighter, no other edge."""
+    flush = half_plane()
+    raised = replace(flush, height_m=0.02, relief_m=0.02)
+    for heading_rad in (0.0, np.pi, np.pi / 2):
+        before, after = (picture_of(one, heading_rad, 151, 0.004, (1e-3, 1e-3))[0] for one in (flush, raised))
+        brighter_mm = 4 * (after - before).sum(axis=0) / (10 * np.log10(1 + np.sqrt(3) ** 3))
+        np.testing.assert_allclose(brighter_mm[10:65], 0.0 if heading_rad else 13.5, atol=1.5)
 
 
 def test_a_beam_is_as_wide_as_beams_are_apart_and_a_pulse_as_long_as_a_bin():
@@ -256,6 +267,17 @@ def plain_evidence(figures: Figures, template: int, x: int, y: int, patch: Patch
     for q in range(1, shades - figure):
         with_shade, c = fitted(one, figure + q, shades + q)
         others.append(with_shade if c[2] < 0 else fitted(one, figure + q)[0])
+    away = 0.015 * (np.stack([i - x, j - y]) - (side - 7) // 2)  # from the middle; three places on each side
+    B = values[:, figure]
+    kept = np.where(B > 0.12, B, 0.0)
+    radius = np.sqrt(2 * (away**2).sum(axis=0) @ np.maximum(B, 0) / np.maximum(B, 0).sum())
+    covered = np.inf
+    for towards in 2 * np.pi * np.arange(12) / 12:
+        for offset in (0.15, 0.4, 0.65):
+            part = kept * (away[0] * np.cos(towards) + away[1] * np.sin(towards) <= offset * radius)
+            A = np.stack([np.ones_like(part), *([values[:, dark]] if delta < 0 else []), part])[:, seen].T
+            c = np.linalg.lstsq(A, level[seen].astype(float), rcond=None)[0]
+            covered = min(covered, float(((level[seen] - A @ c) ** 2).sum())) if c[-1] > 0 else covered
     off = smooth - floor - beta * design[:, 1] - delta * design[:, 0]
     near, far, back = ((zones & zone > 0) & held for zone in (NEAR, FAR, BEHIND))
     back &= seen
@@ -268,8 +290,10 @@ def plain_evidence(figures: Figures, template: int, x: int, y: int, patch: Patch
         np.log((np.mean(np.maximum(off[near], 0) ** 2) if near.sum() > 8 else mean_square / 3) + 0.3),
         np.log((np.mean(np.minimum(off[far], 0) ** 2) if far.sum() > 8 else mean_square / 3) + 0.3),
         np.mean(level[back] - floor) if back.sum() > 5 else 0.0,
-        np.sqrt(max(np.log(shaded / both), 0.0)),
+        np.sqrt(max(min(np.log(shaded / both), np.log(fitted(one, dark)[0] / best)), 0.0)) if delta < 0 else 0.0,
         float(not figures.has_dark[template]),
+        np.log(min(covered, best) / (level[seen] @ level[seen])),
+        np.log(best / min(covered, best)),
     ]
 
 
@@ -286,9 +310,14 @@ def test_evidence_is_that_of_least_squares_over_the_cells_in_view(appearance, ri
         level[i, j] += (0.3, 1.0)[template % 2] * templates.pictures[template]
         level[side // 2 + (5, 12)[template % 2] :] -= (0, 8)[template // 2 % 2]
         patch = Patch.of(level * seen, seen, np.zeros(2))
-        (found,) = figures.evidence(patch, np.array([template]), np.array([[3, 2]]))
-        np.testing.assert_allclose(found, plain_evidence(figures, template, 3, 2, patch), atol=5e-5)
-        has |= {name for name, value in zip(EVIDENCE, found, strict=True) if value != 0}
+        another, at = (template + 1) % len(templates.design), np.array([[3, 2], [3, 3]])
+        found, rival = figures.evidence(patch, np.array([template, another]), at)
+        expected = np.array(plain_evidence(figures, template, 3, 2, patch))
+        shares = expected[9], plain_evidence(figures, another, 3, 3, patch)[9]
+        expected[9] = min(shares) - expected[9]
+        np.testing.assert_allclose(found, expected, atol=5e-5)
+        assert rival[9] == pytest.approx(min(shares) - shares[1], abs=5e-5)
+        has |= {name for name, *values in zip(EVIDENCE, found, rival, strict=True) if any(values)}
     assert has == {*EVIDENCE} - ({"bare"} if figures.has_dark.all() else set())
 
 

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from sonar_graph.sonar.bayes import Beliefs, IdentityParams, bounded_evidence, jeffrey, news_of_motion, predict
 from sonar_graph.sonar.confusion import Confusion
+from sonar_graph.sonar.evidence import EVIDENCE
 from sonar_graph.sonar.tracker import Association
 
 UNIFORM = np.full((1, 4), 0.25)
@@ -121,7 +122,8 @@ def test_news_follow_from_the_autocorrelation_of_a_triangle():
 
 
 CONFUSION = Confusion(
-    ids=(1, 2), matrix=((0.9, 0.05, 0.05), (0.05, 0.9, 0.05), (0.05, 0.05, 0.9)), weights=(0.0,) * 9, looks=2.0,
+    ids=(1, 2), matrix=((0.9, 0.05, 0.05), (0.05, 0.9, 0.05), (0.05, 0.05, 0.9)),
+    weights=(0.0,) * len(EVIDENCE), looks=2.0,
     range_sigma_m=0.01, across_sigma_m=0.006, range_bound_m=1e-3, across_bound_m=1e-3, bound_power=1.5,
 )  # fmt: skip
 LOOKS_LIKE_1 = np.array([[6.0, -3.0, 0.0]])

@@ -19,6 +19,7 @@ from sonar_graph.sonar.confusion import (
     read_confusion,
     soft_scores,
 )
+from sonar_graph.sonar.evidence import EVIDENCE
 
 RING = LandmarkDesign(9, "ring", 0.3, np.zeros((4, 4)))
 DESIGNS = [RING, replace(RING, id=10)]
@@ -27,14 +28,14 @@ ROWS = ((0.8, 0.1, 0.1), (0.2, 0.7, 0.1), (0.5, 0.1, 0.4))
 
 def model(rows: tuple[tuple[float, ...], ...] = ROWS, designs: Sequence[LandmarkDesign] = ()) -> Confusion:
     return Confusion(
-        ids=tuple(range(9, 8 + len(rows))), matrix=rows, designs=tuple(map(mark_of, designs)), weights=tuple(range(9)),
-        looks=2.0, range_sigma_m=0.01, across_sigma_m=0.004,
+        ids=tuple(range(9, 8 + len(rows))), matrix=rows, designs=tuple(map(mark_of, designs)),
+        weights=tuple(range(len(EVIDENCE))), looks=2.0, range_sigma_m=0.01, across_sigma_m=0.004,
         range_bound_m=1e-3, across_bound_m=1e-3, bound_power=1.5,
     )  # fmt: skip
 
 
 def test_log_odds_are_weighted_evidence_and_scores_the_posterior_of_one_look():
-    evidence = np.eye(9)[[2, 5]]
+    evidence = np.eye(len(EVIDENCE))[[2, 5]]
     np.testing.assert_allclose(model().log_odds(evidence), [2, 5])
     scores = soft_scores(np.array([[3.0, -6.0, 0.0]]), 2.0)[0]
     np.testing.assert_allclose(scores, np.exp([1, -2, 0]) / np.exp([1, -2, 0]).sum())
@@ -70,7 +71,7 @@ def test_what_was_never_confused_in_the_shipped_model_is_bounded_by_its_tracks()
         ({"range_sigma_m": float("inf")}, "range_sigma_m"),
         ({"weights": [float("nan")] * 9}, "weights"),
         ({"ids": [1, 1]}, "ids: expected each once, not 1, 1"),
-        ({"weights": [1.0, 2.0]}, "weights: expected 9, for prior, outline"),
+        ({"weights": [1.0, 2.0]}, "weights: expected 11, for prior, outline"),
         ({"sharpness": 17.0, "threshold": 0.8}, "an earlier version .* measure it again"),
         ({"error_correlation": 0.8}, "an earlier version .* measure it again"),
         (None, "not JSON"),
