@@ -92,6 +92,8 @@ class Figures(NamedTuple):
     """Whether it has dark parts, shape (templates,)."""
     strips: NDArray[np.uint8]
     """Number of edges of each direction that a cell lies beyond, shape (n, EDGES)."""
+    kept: Floats
+    """`kept_sums` of each template, shape (templates, EDGES, offsets, 3)."""
     independent: float
     """Share of the cells that are independent: cells are not where the sonar resolves less."""
 
@@ -127,14 +129,15 @@ class Figures(NamedTuple):
             x, y = np.nonzero(compared)
             strips = (beyond_m[compared] > radius_m(figure, away_m) * np.array(OFFSETS)[:, None, None]).sum(axis=0)
             own = x * (side + last) + y, values, smooth, zones[compared], strips.astype(np.uint8)
-            columns.append((*own, gram, has_dark))
-        *rows, grams, darks = zip(*columns, strict=True)
+            kept = np.empty((EDGES, len(OFFSETS), 3))
+            kept_sums(values, np.ones(len(values), np.float32), own[-1], kept)
+            columns.append((*own, gram, has_dark, kept))
+        *rows, grams, darks, sums = zip(*columns, strict=True)
         first = np.cumsum([0, *map(len, rows[0])])
         cells, values, smooth, zones, strips = (np.ascontiguousarray(np.concatenate(of)) for of in rows)
         independent = math.prod(min(cell_m / (HALF_POWER * blur), 1.0) for blur in blur_m)
-        return cls(
-            side + last, first, cells, values, smooth, zones, np.array(grams), np.array(darks), strips, independent
-        )
+        of_templates = np.array(grams), np.array(darks), strips, np.array(sums)
+        return cls(side + last, first, cells, values, smooth, zones, *of_templates, independent)
 
     def evidence(self, patch: Patch, template: Ints, cell: Ints) -> Floats | None:
         """`EVIDENCE` of templates on the parts of a patch that begin at some cells, shapes (n,), (n, 2), (n, 11).
@@ -145,7 +148,7 @@ class Figures(NamedTuple):
         is_measured = fill_evidence(
             patch.level_db.ravel(), patch.seen.ravel(), patch.smooth_db.ravel(), patch.held.ravel(), self.patch_side,
             self.first, self.cells, self.values, self.smooth, self.zones, self.gram, self.has_dark, self.strips,
-            template, cell, found,
+            self.kept,             template, cell, found,
         )  # fmt: skip
         found[:, RATIOS] *= self.independent
         found[:, EVIDENCE.index("plate")] *= math.sqrt(self.independent)
@@ -156,7 +159,7 @@ class Figures(NamedTuple):
 def fill_evidence(
     level_db: Floats32, seen: Floats32, smooth_db: Floats32, held: Floats32, side: int,
     first_of: Ints, all_cells: Ints, all_values: Floats32, all_smooth: Floats32, all_zones: Ints, grams: Floats,
-    has_dark: Bools, all_strips: NDArray[np.uint8], template: Ints, cell: Ints, found: Floats,
+    has_dark: Bools, all_strips: NDArray[np.uint8], all_kept: Floats, template: Ints, cell: Ints, found: Floats,
 ) -> bool:  # fmt: skip
     """Fill in `EVIDENCE` of templates on the parts of a patch that begin at some cells, shape (n, 11).
 
@@ -233,7 +236,11 @@ def fill_evidence(
         plate, foam = math.log(shaded / both), math.log(max(only_dark, 1e-3) / design)
         found[k, 7] = math.sqrt(max(min(plate, foam), 0.0)) if delta < 0 else 0.0
         found[k, 8] = 0.0 if has_dark[template[k]] else 1.0
-        covered = least_covered(level[0], is_seen, values, all_strips[begin:end], count, gram, only_dark, dz, delta < 0)
+        strips, kept = all_strips[begin:end], all_kept[template[k]]
+        if count < rows:
+            kept = np.empty(kept.shape)
+            kept_sums(values, is_seen, strips, kept)
+        covered = least_covered(level[0], values, strips, kept, count, gram, only_dark, dz, delta < 0)
         covered = min(covered, design)
         found[k, 9], found[k, 10] = math.log(covered / total), math.log(design / covered)
         least = min(least, found[k, 9])
@@ -243,8 +250,22 @@ def fill_evidence(
 
 
 @compiled
+def kept_sums(values: Floats32, seen: Floats32, strips: NDArray[np.uint8], kept: Floats) -> None:
+    """Fill in sums of b, b^2 and b D over the cells of a figure up to each edge, shape (EDGES, offsets, 3)."""
+    kept[:] = 0.0
+    for n in range(len(values)):
+        b = values[n, 2] * seen[n]
+        if b > OUT:
+            for e in range(strips.shape[1]):
+                for strip in range(strips[n, e], kept.shape[1]):
+                    kept[e, strip, 0] += b
+                    kept[e, strip, 1] += b * b
+                    kept[e, strip, 2] += b * values[n, 1]
+
+
+@compiled
 def least_covered(
-    level: Floats32, seen: Floats32, values: Floats32, strips: NDArray[np.uint8], count: float, gram: Floats,
+    level: Floats32, values: Floats32, strips: NDArray[np.uint8], kept: Floats, count: float, gram: Floats,
     only_dark: float, dz: float, has_dark: bool,
 ) -> float:  # fmt: skip
     """Least sum of squares that a figure leaves of which all beyond a straight edge is covered, with D or without.
@@ -252,26 +273,24 @@ def least_covered(
     The floor and D are taken out of the figure first: ``R = R(floor, D) - (b^T z)^2 / b^T b``. ``only_dark`` is
     R(floor, D), ``dz`` the product of D, without its mean, and z.
     """
-    edges = strips.shape[1]
-    of_strip = np.zeros((len(OFFSETS) + 1, edges, 4))
+    edges, offsets, _ = kept.shape
+    products = np.zeros((offsets + 1, edges), np.float32)
     for n in range(len(level)):
-        b = values[n, 2] * seen[n]
-        if b > OUT:
-            bb, bd, bz = b * b, b * values[n, 1], b * level[n]
+        if values[n, 2] > OUT:
+            bz = values[n, 2] * level[n]
             for e in range(edges):
-                to = of_strip[strips[n, e], e]
-                to[0], to[1], to[2], to[3] = to[0] + b, to[1] + bb, to[2] + bd, to[3] + bz
+                products[strips[n, e], e] += bz
     dark_mean, dd, least = gram[0, 1] / count, gram[1, 1] - gram[0, 1] ** 2 / count, only_dark
     for e in range(edges):
-        kept = np.zeros(4)
-        for strip in range(len(OFFSETS)):
-            kept += of_strip[strip, e]
-            bb, bz = kept[1] - kept[0] ** 2 / count, kept[3]
+        bz = 0.0
+        for strip in range(offsets):
+            bz += products[strip, e]
+            b, bb, with_z = kept[e, strip, 0], kept[e, strip, 1] - kept[e, strip, 0] ** 2 / count, bz
             if has_dark:
-                bd = kept[2] - kept[0] * dark_mean
-                bb, bz = bb - bd**2 / dd, bz - bd * dz / dd
-            if bb > 0 and bz > 0:
-                least = min(least, only_dark - bz**2 / bb)
+                bd = kept[e, strip, 2] - b * dark_mean
+                bb, with_z = bb - bd**2 / dd, bz - bd * dz / dd
+            if bb > 0 and with_z > 0:
+                least = min(least, only_dark - with_z**2 / bb)
     return max(least, 1e-3)
 
 
