@@ -33,6 +33,9 @@ CARRIED_IN_GAP_NS = 300_000_000
 """Longest time over which a sample of depth or heading is carried straight on over the end of a gap."""
 LONGEST_LATE_NS = 60_000_000_000
 """Age of a position fix up to which rows for it are kept, where the window is longer."""
+FIX_GAIN = 50.0
+"""Weight of what a position fix has to tell beside what a sighting has: with the default ``waiting_gain`` of 5, fixes
+that would take less than a tenth of the position's variance together wait for the next keyframe."""
 EARLIEST_NS, LATEST_NS = np.iinfo(np.int64).min, np.iinfo(np.int64).max
 
 
@@ -351,7 +354,10 @@ class Keyframes:
         self.smoother.add({"heading": factors.heading(X(j), key, measured, mean_variance**0.5)})
 
     def add_fix(self, stamp_ns: int, position_m: Floats, cov_m2: Floats) -> None:
-        """Hang a position fix on the keyframe before it; refuse one before the window, or before rows that are kept."""
+        """Hang a position fix on the keyframe before it; refuse one before the window, or before rows that are kept.
+
+        It enters the estimate at once, unless it has next to nothing to tell (`FIX_GAIN`).
+        """
         i = bisect_right(self.stamps_ns, stamp_ns) - 1
         if i < 0 or self.stamps_ns[i] < self.stamps_ns[-1] - self._lag_ns or not self.smoother.in_window([X(i)]):
             self.refuse("positions", stamp_ns, Refusal.LATE)
@@ -366,7 +372,13 @@ class Keyframes:
         by_motion = R_i @ motion.i_T_j.rotation().matrix() @ np.hstack((-cross_matrix(antenna), np.eye(3)))
         cov_m2 = cov_m2 + by_motion @ motion.covariance @ by_motion.T
         factor = factors.position(X(i), position_m, motion.i_T_j.transformFrom(antenna), cov_m2)
-        self.smoother.add({"position": factor}, gain=np.inf)
+        gain = np.inf
+        if i == len(self.stamps_ns) - 1 and not self.smoother.is_due:
+            arm = motion.i_T_j.transformFrom(antenna)
+            by_pose = R_i @ np.hstack((-cross_matrix(arm), np.eye(3)))
+            predicted = by_pose @ self.smoother.joint_covariance([X(i)]).at(X(i), X(i)) @ by_pose.T
+            gain = FIX_GAIN * float((predicted.diagonal() / cov_m2.diagonal()).max())
+        self.smoother.add({"position": factor}, gain=gain)
 
     def _constrain(self, j: int) -> None:
         if self.calibration.planar:

@@ -110,6 +110,24 @@ def test_fixes_in_a_map_grid_are_named_with_the_origin_that_brings_them_to_the_s
     ]
 
 
+@pytest.mark.parametrize("every_s", [0.1, 1.0, 30.0])
+def test_fixes_that_no_vehicle_can_follow_are_named_and_outliers_among_good_ones_are_not(every_s: float):
+    good = fixed(SLOW if every_s < 30 else RIGHT, sigma_m=2.5, every_s=every_s)
+    places = good.positions.position_m
+    yaw_deg = np.degrees(np.interp(good.positions.stamps_ns, good.truth.stamps_ns, yaw_of(good)))
+    angles = np.column_stack([0 * yaw_deg, 0 * yaw_deg, 10 * yaw_deg])
+    spikes = places + 500.0 * (np.arange(len(places)) % 20 == 3)[:, None]
+    for wrong, is_named in ((places, False), (spikes, False), (angles, True)):
+        given = replace(good, positions=replace(good.positions, position_m=wrong))
+        found = [f.quantity for f in aiding_check.position_findings(given, NO_CONFIG) if f.acts]
+        assert ("position fixes: jumps" in found) == is_named, (found, every_s)
+        assert [f.quantity for f in doubts(given, NO_CONFIG) if "jumps" in f.quantity] == found
+
+
+def yaw_of(run: Sequence) -> np.ndarray:
+    return np.unwrap(run.truth.rotations().as_euler("ZYX")[:, 0])
+
+
 @pytest.mark.parametrize("places", ["fixes", "true positions", "neither"])
 def test_a_heading_of_another_world_is_told_by_positions_with_the_offset_that_puts_it_right(places: str):
     """A Doppler log that is turned on the body is no turn of the heading."""

@@ -158,9 +158,7 @@ def _guess(name: str, file: CsvFile) -> Iterator[_Guess]:
         yield _Guess("heading", name, [*stamp, *lines])
 
 
-def _motion(
-    columns: list[_Column], forces: list[_Column] | None, *, is_truth: bool
-) -> tuple[str, list[str]] | None:
+def _motion(columns: list[_Column], forces: list[_Column] | None, *, is_truth: bool) -> tuple[str, list[str]] | None:
     """Role and lines of an IMU, else of a Doppler log: velocities beside a truth are true ones."""
     rates = _triple(columns, _RATE) or _named(columns, "p", "q", "r")
     velocity = _triple(columns, _VELOCITY) or _named(columns, "u", "v", "w")
