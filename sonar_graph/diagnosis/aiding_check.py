@@ -21,6 +21,7 @@ from sonar_graph.diagnosis.findings import (
     in_degrees,
     matters,
     numbers,
+    turned_mounting,
 )
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.measurements import NS_PER_S, Floats, Heading, Imu, Ints, PositionFixes
@@ -28,7 +29,7 @@ from sonar_graph.navigation.alignment import Estimate1D
 from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.sequence import Sequence
 
-HEADING_SENSE = "heading: turn over that of the gyros"
+HEADING_SENSE, HEADING_TURN = "heading: turn over that of the gyros", "heading: turn towards the positions"
 WINDOW_NS = 10 * NS_PER_S
 FEWEST_WINDOWS = 6
 LARGEST_HEADING_SIGMA_RAD = 0.25
@@ -145,9 +146,15 @@ def heading_findings(right: Sequence, config: LogConfig) -> Iterator[Finding]:
     advice = f"the calibration's bias sigma of {allowed:.2g} rad allows it, {NO_NEED}"
     if acts:
         offset = config.number("heading", "yaw_offset_rad", 0.0) + angle.value
-        line = f"`yaw_offset_rad = {offset:.3f}` under [heading] {IN_LOG_CONFIG}"
-        advice = f"its world, north or mounting is another: {line}"
-    yield Finding("heading: turn towards the positions", in_degrees(angle), "°", advice, acts)
+        rpy = numbers(turned_mounting(right.calibration.dvl, angle.value), 4)
+        vertical = vertical_bias(right)
+        first = "once the gyro bias is put right, which comes first, " if vertical is not None and vertical.acts else ""
+        advice = (
+            f"{first}either its world, north or mounting is another: `yaw_offset_rad = {offset:.3f}` under [heading] "
+            f"{IN_LOG_CONFIG}; or the Doppler log is turned on the vehicle: `dvl.mounting.rpy_rad = {rpy}` "
+            f"{IN_CALIBRATION}"
+        )
+    yield Finding(HEADING_TURN, in_degrees(angle), "°", advice, acts)
 
 
 def displacements(right: Sequence, stamps_ns: Ints, places: Floats, yaw_rad: Floats) -> tuple[Floats, Floats]:

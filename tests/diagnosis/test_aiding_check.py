@@ -156,8 +156,24 @@ def test_a_heading_of_another_world_is_told_by_positions_with_the_offset_that_pu
         assert finding.acts == wrong
         if wrong:
             assert line_of(finding) == pytest.approx({"yaw_offset_rad": before - off_rad}, abs=0.04)
+            cure = tomllib.loads(finding.advice.split("`")[3])["dvl"]["mounting"]["rpy_rad"]
+            assert cure == pytest.approx([0.0, 0.0, 0.7 - off_rad], abs=0.04)
+            turned = with_mounting(run, "dvl", rpy_rad=cure)
+            assert not [f for f in aiding_check.heading_findings(turned, config) if f.acts]
+            assert finding.quantity in [f.quantity for f in doubts(run, config)]
     still = replace(run, dvl=replace(run.dvl, velocity=0 * velocity))
     assert not any(f.estimate.is_known for f in list(aiding_check.heading_findings(still, LogConfig()))[1:])
+
+
+@pytest.mark.parametrize(("off_deg", "gyro_bias"), [(6.0, 0.0), (20.0, 0.0), (20.0, 0.01)])
+def test_a_turned_heading_is_a_warning_beyond_ten_degrees_and_a_gyro_bias_comes_first(off_deg, gyro_bias):
+    imu = replace(RIGHT.imu, angular_velocity=RIGHT.imu.angular_velocity + np.array([0.0, 0.0, gyro_bias]))
+    run = compass(replace(RIGHT, imu=imu), lambda yaw_rad: yaw_rad + np.radians(off_deg))
+    found = doubts(run, NO_CONFIG)
+    turned = [f for f in found if f.quantity == "heading: turn towards the positions"]
+    assert [f.acts for f in turned] == [True] * (off_deg > 10)
+    assert ["gyro bias is put right, which comes first" in f.advice for f in turned] == [gyro_bias > 0] * len(turned)
+    assert not turned or found[-1] == turned[0]
 
 
 @pytest.mark.parametrize("upside_down", [False, True])
