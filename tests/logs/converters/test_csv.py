@@ -206,6 +206,7 @@ def test_a_template_of_tables_with_names_and_units_reads_them_unedited(tmp_path)
 
 OF_IMU = "time,positionX,positionY,positionZ,gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z"
 
+
 @pytest.mark.parametrize(
     ("tables", "live"),
     [
@@ -223,7 +224,7 @@ def test_a_template_prefers_latitudes_and_asks_about_places_that_an_imu_measures
     fixes = tomllib.loads(text).get("positions")
     assert (fixes and fixes["file"]) == live
     if live is None:
-        assert '# [positions]  # in the table of an IMU' in text
+        assert "# [positions]  # in the table of an IMU" in text
         assert '# position = ["positionX", "positionY", "positionZ"]' in text
 
 
