@@ -66,7 +66,7 @@ class LogConfig:
             if isinstance(table, Mapping) and "file" in table:
                 raise LogError(
                     f"{source}: says which text tables are what ([{role}] file), not what the topics of a log are: "
-                    f"give it to `sonar-graph convert csv TABLES --config {source} -o OUT.mcap`; a log that was made by it "
+                    f"give it to `sonar-graph convert csv TABLES --config {source} -o OUT.mcap`; a log made by it "
                     f"needs a log configuration only for what is still to be changed"
                 )
         for role, table in values.items():
