@@ -69,6 +69,7 @@ def test_scores_nobody_foresaw_are_shown_too_and_doubts_about_a_log_stand_at_the
     top = html[: html.index('class="summary"')]
     assert "Warning: imu: no sample 3.000 to 9.000 s after the start" in top
     assert "5 of 5 rows" not in top
+    assert html.index('href="#warnings">1 warning</a>') < html.index('class="headline"') < html.index('id="figure-map"')
 
 
 def test_a_failed_run_is_named_first_with_its_reason_escaped(comparison):
