@@ -51,7 +51,9 @@ from sonar_graph.measurements import (
 )
 from sonar_graph.motion import MotionSource, require_source
 from sonar_graph.navigation.alignment import earth_rate_in_world, tilt_sigma
+from sonar_graph.numerics import cross_matrix
 from sonar_graph.slam.landmarks import MINIMUM_PROBABILITY, identify
+from sonar_graph.slam.models import Contradictions, wrap_angle, yaw_and_derivative
 from sonar_graph.states import (
     OUTCOME_NUMBERS,
     CausalEstimates,
@@ -110,6 +112,7 @@ class FilterShell(ABC):
         self._slots: dict[int, int] = {}
         self._journal, self._estimates = DetectionJournal(), CausalEstimates()
         self._refused: list[RefusedRow] = []
+        self._contradictions = Contradictions()
 
     # ---------------------------------------------------------------- mathematics of a filter
 
@@ -219,17 +222,18 @@ class FilterShell(ABC):
         return self._journal.log()
 
     def withheld(self) -> list[str]:
-        """Message about detections that a gate would have kept out, of most that it saw (`admit`)."""
+        """Messages about headings and fixes that the state contradicts, and detections outside the gate (`admit`)."""
         log = self.detections()
         let_in = [
             stamp for stamp, why in zip(log.stamps_ns.tolist(), log.outcomes, strict=True) if why is Outcome.LET_IN
         ]
         if not let_in:
-            return []
+            return self._contradictions.messages()
         return [
+            *self._contradictions.messages(),
             f"most of {JUDGED_TOGETHER} detections in a row, of landmarks that had agreed, were outliers, first at"
             f" {let_in[0] * 1e-9:.3f} s, so {len(let_in)} were used outside the gate: the filter was wrong, not they,"
-            " and the gate may be the cause; give gate_probability = 1, or larger noise"
+            " and the gate may be the cause; give gate_probability = 1, or larger noise",
         ]
 
     def refused_rows(self) -> list[RefusedRow]:
@@ -311,13 +315,20 @@ class FilterShell(ABC):
         """Update by a position fix, with the calibration's noise where it has none."""
         cov_m2, known = fixes.covariance_m2[row], self.calibration.positions
         cov_m2 = np.diag(np.square(known.sigma_m)) if np.isnan(cov_m2).any() else cov_m2
-        self.correct_position(motion, np.array(known.antenna_m), fixes.position_m[row], cov_m2)
+        antenna, (R, X, P) = np.array(known.antenna_m), self.pose_after(motion)
+        e, H = fixes.position_m[row] - X - R @ antenna, R @ np.hstack((-cross_matrix(antenna), np.eye(3)))
+        self._contradictions.judge("positions", math.sqrt(e @ np.linalg.solve(H @ P @ H.T + cov_m2, e)))
+        self.correct_position(motion, antenna, fixes.position_m[row], cov_m2)
 
     def _turn(self, motion: Motion, heading: Heading, row: int) -> None:
         """Update by a heading, with the calibration's noise where it has none."""
         sigma_rad = float(heading.sigma_rad[row])
         sigma_rad = self.calibration.heading.sigma_rad if math.isnan(sigma_rad) else sigma_rad
-        self.correct_heading(motion, float(heading.yaw_rad[row]), sigma_rad**2)
+        yaw_rad, (R, _, P) = float(heading.yaw_rad[row]), self.pose_after(motion)
+        predicted_rad, by_turn = yaw_and_derivative(R)
+        variance_rad2 = by_turn @ P[:3, :3] @ by_turn + sigma_rad**2 + self.calibration.heading.bias_sigma_rad**2
+        self._contradictions.judge("heading", abs(wrap_angle(yaw_rad - predicted_rad)) / math.sqrt(variance_rad2))
+        self.correct_heading(motion, yaw_rad, sigma_rad**2)
 
     def _use(self, end_ns: int, samples: dict[int, Any], since_ns: int, ids: Ints, views: Views) -> Estimate:
         """Carry the state to the newest epoch reached at the end of the call, with all measurements on the way."""

@@ -88,10 +88,10 @@ def refused_rows_of(estimator: Estimator) -> list[RefusedRow]:
 
 @runtime_checkable
 class TellsWithheld(Protocol):
-    """Optional part of the contract: an estimator that names measurements which it could not use yet."""
+    """Optional part of the contract: an estimator that names measurements which it could not use, or contradicts."""
 
     def withheld(self) -> list[str]:
-        """Messages, a line each: what is withheld, and what is missing."""
+        """Messages, a line each: what is withheld, and what is missing; what contradicts the estimate."""
         ...
 
 

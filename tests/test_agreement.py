@@ -255,6 +255,38 @@ def test_headings_of_one_stamp_in_two_calls_both_count(kind):
     assert sigmas == pytest.approx([0.09, 1 / (1 / 0.09 + 1 / one), 1 / (1 / 0.09 + 1 / two)], rel=1e-2)
 
 
+@pytest.mark.parametrize("kind", [EkfSlam, InvariantEkf, Isam2])
+@pytest.mark.parametrize(
+    ("wrong", "said"), [("heading", "headings contradict its yaw"), ("positions", "position fixes")]
+)
+def test_an_estimate_too_sure_to_follow_its_headings_or_fixes_says_how_many_contradict_it(kind, wrong, said):
+    """Its compass' bias follows them in time and hides that. Single outliers and an unsure start are no matter."""
+    world = aided_world()
+    sure = world.calibration.start.model_copy(update={"rpy_sigma_rad": (1e-3,) * 3, "position_sigma_m": (1e-3,) * 3})
+    off, wide = {"heading": (2.0, {"rpy_sigma_rad": (0.01, 0.01, 2.0)})}.get(
+        wrong, (40.0, {"position_sigma_m": (50.0,) * 3})
+    )
+    unsure = sure.model_copy(update=wide)
+    for start, share, is_told in ((sure, 1, True), (sure, 10, False), (unsure, 1, False), (sure, 0, False)):
+        heading, fixes = world.heading, world.positions
+        yaw_rad, places = heading.yaw_rad.copy(), fixes.position_m.copy()
+        if share:
+            (yaw_rad if wrong == "heading" else places[:, :2])[::share] += off  # depths know z
+        known = world.calibration.model_copy(update={"start": start})
+        given = replace(world, calibration=known, detections=None)
+        if wrong == "heading":
+            given = replace(given, heading=replace(heading, yaw_rad=yaw_rad), positions=None)
+        else:
+            given = replace(given, heading=None, positions=replace(fixes, position_m=places))
+        estimator = made(kind, known)
+        run(estimator, given)
+        told = [line for line in estimator.withheld() if said in line]
+        assert bool(told) == is_told, (share, start == sure, estimator.withheld())
+        if told:
+            count, judged = map(int, told[0].split(" ")[0:3:2])
+            assert 0.8 * judged < count <= judged <= len(heading if wrong == "heading" else fixes)
+
+
 NO_ROWS = {
     "sigma of more than a turn": Heading(np.array([0]), np.zeros(1), np.full(1, 1e200)),
     "more turns than a double keeps": Heading(np.array([0]), np.full(1, 1e300), np.full(1, 0.01)),

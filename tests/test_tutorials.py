@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import textwrap
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
 
 from sonar_graph.logs.adapters.log_config import read_log_config
+from sonar_graph.logs.convert.csv_log import parse_csv_config
 from sonar_graph.logs.reading import read_log
 from sonar_graph.logs.vehicle_setup import PartialCalibration
 from sonar_graph.recognition.confusion_fit import LEAST_FRAMES
@@ -213,7 +215,9 @@ def test_the_notebook_is_stored_without_output_and_shows_tables_and_figures_when
 
 def test_page_on_tables_has_a_program_and_a_configuration_that_give_the_simulated_run(tmp_path):
     page = (TUTORIALS / "11_tables.md").read_text(encoding="utf-8")
-    ((making,), (configuration,)) = blocks(page, "python"), blocks(page, "toml")
+    ((making,), (configuration, more, vehicle)) = blocks(page, "python"), blocks(page, "toml")
+    parse_csv_config(tomllib.loads(configuration) | tomllib.loads(more), "the page")
+    PartialCalibration.parse(tomllib.loads(vehicle), "the page")
     output(tmp_path, "python", "-W", "error", "-c", making)
     for line in re.findall(r"^    sonar-graph (.*)$", page, re.MULTILINE):
         words, _, target = line.partition(" > ")

@@ -58,6 +58,8 @@ def csv(
     overwrite: Overwrite = False,
 ) -> None:
     """Tables of any vehicle: IMU, Doppler log, depth, heading, fixes, detections, truth; delimiters are found."""
+    from sonar_graph.diagnosis import doubts
+    from sonar_graph.logs.adapters import LogConfig
     from sonar_graph.logs.convert import csv_template, read_csv
 
     if toml:
@@ -72,6 +74,9 @@ def csv(
     for subject, heading in (("csv.left_out", "left out"), ("csv.warnings", "warning")):
         if subject in sequence.notes:
             echo(f"{heading}: {sequence.notes[subject]}", err=True)
+    for finding in doubts(sequence, LogConfig()):
+        if finding.quantity.endswith(": unit"):
+            echo(f"warning: {finding.quantity}: {finding.text()} (or in {config}, and convert again)", err=True)
     echo(f"What is in it: sonar-graph inspect {output}")
 
 

@@ -58,6 +58,7 @@ def inspect(
         echo(summary.toml, nl=False)
         return
     findings: list[Finding] = []
+    grave: set[str] = set()
     skipped = large = ""
     is_usable = not (summary.obstacles or summary.unusable or summary.damage)
     if quick:
@@ -65,9 +66,10 @@ def inspect(
     elif summary.obstacles:
         skipped = f"not compared: {', '.join(summary.obstacles)}"
     else:
-        from sonar_graph.diagnosis import check_sensors
+        from sonar_graph.diagnosis import check_sensors, doubts
         from sonar_graph.evaluation import expense
         from sonar_graph.logs import read_log
+        from sonar_graph.logs.adapters import LogConfig
 
         is_read = False
         try:
@@ -78,6 +80,7 @@ def inspect(
                 is_read = True
                 large = expense(sequence)
                 findings = check_sensors(sequence, config)
+                grave = {finding.quantity for finding in doubts(sequence, config or LogConfig())}
         except SonarGraphError as error:
             skipped, is_usable = f"not compared: {error}", is_usable and is_read
     if as_json:
@@ -85,15 +88,15 @@ def inspect(
         content |= {"obstacles": summary.obstacles, "sensors": [finding.plain() for finding in findings]}
         echo(strict_json(content | {"sensors_skipped": skipped, "large": large}))
     else:
-        print_summary(summary, findings, skipped, large)
+        print_summary(summary, findings, grave, skipped, large)
     if not is_usable:
         raise typer.Exit(UNUSABLE)
     if summary.warnings or any(finding.acts for finding in findings):
         raise typer.Exit(DOUBTFUL)
 
 
-def print_summary(summary: LogSummary, findings: list[Finding], skipped: str, large: str = "") -> None:
-    """Print the tables of a log, and a line for each note, finding and warning."""
+def print_summary(summary: LogSummary, findings: list[Finding], grave: set[str], skipped: str, large: str = "") -> None:
+    """Print the tables of a log, and a line for each note, finding and warning, as which ``grave`` quantities count."""
     console = answers()
 
     def say(heading: str, text: str, style: str = "bold") -> None:
@@ -129,7 +132,8 @@ def print_summary(summary: LogSummary, findings: list[Finding], skipped: str, la
     else:
         console.print("\n[bold]sensors against each other[/] (± 95 %)")
         for finding in findings:
-            say(finding.quantity, finding.text(), "bold yellow" if finding.acts else "bold")
+            warned = "warning: " if finding.quantity in grave else ""
+            say(warned + finding.quantity, finding.text(), "bold yellow" if finding.acts else "bold")
         console.print()
     if large:
         say("large", large, "bold yellow")

@@ -89,7 +89,13 @@ def view(
             advice = "; ".join(f"{name}: {one.install}" for name, one in VIEWERS.items())
             echo(f"No viewer for {RESULT_LOG} is installed ({advice})", err=True)
         if page is None:
-            raise EvaluationError(f"{result}: has no {PAGE}; sonar-graph report {result} writes it")
+            if result.is_file() and result.name != RESULT_LOG:
+                raise EvaluationError(
+                    f"{result}: is a log, with no {PAGE} beside it; a viewer shows it ({', '.join(VIEWERS)}), and "
+                    f"`sonar-graph compare {result} -o DIR` makes a result of it"
+                )
+            folder = result if result.is_dir() else result.parent
+            raise EvaluationError(f"{result}: has no {PAGE}; sonar-graph report {folder} writes it")
         is_open = has_screen() and webbrowser.open(page.absolute().as_uri())
         echo(f"{'Opened' if is_open else 'No screen here; open'} {page}")
         return

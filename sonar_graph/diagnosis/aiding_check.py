@@ -21,21 +21,28 @@ from sonar_graph.diagnosis.findings import (
     in_degrees,
     matters,
     numbers,
+    turned_mounting,
 )
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.measurements import NS_PER_S, Floats, Heading, Imu, Ints, PositionFixes
 from sonar_graph.navigation.alignment import Estimate1D
+from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.sequence import Sequence
 
-HEADING_SENSE = "heading: turn over that of the gyros"
+HEADING_SENSE, HEADING_TURN = "heading: turn over that of the gyros", "heading: turn towards the positions"
 WINDOW_NS = 10 * NS_PER_S
 FEWEST_WINDOWS = 6
 LARGEST_HEADING_SIGMA_RAD = 0.25
 LARGEST_TURN_SIGMA = 0.25
 """Of k, so that 1 and -1 are eight sigmas apart."""
 UNITS_M = {"mm": 1e-3, "cm": 1e-2, "km": 1e3, "degrees": 1.1e5}
+HIGH_PERCENTILE = 95.0
 LARGEST_RATIO = 10.0
 """Of displacements by fixes over those by the Doppler log, either way; no noise within the calibration's makes it."""
+JUMP_NS = 2 * WINDOW_NS
+JUMP_GATE = chi_square_quantile(1 - 1e-4, 3)
+LARGEST_JUMPING_SHARE = 0.2
+"""Of the fixes; single outliers are what a robust kernel is for."""
 FARTHEST_ORIGIN_M = 1e5
 """No vehicle of a run goes so far; coordinates of a map grid begin beyond."""
 
@@ -139,9 +146,15 @@ def heading_findings(right: Sequence, config: LogConfig) -> Iterator[Finding]:
     advice = f"the calibration's bias sigma of {allowed:.2g} rad allows it, {NO_NEED}"
     if acts:
         offset = config.number("heading", "yaw_offset_rad", 0.0) + angle.value
-        line = f"`yaw_offset_rad = {offset:.3f}` under [heading] {IN_LOG_CONFIG}"
-        advice = f"its world, north or mounting is another: {line}"
-    yield Finding("heading: turn towards the positions", in_degrees(angle), "°", advice, acts)
+        rpy = numbers(turned_mounting(right.calibration.dvl, angle.value), 4)
+        vertical = vertical_bias(right)
+        first = "once the gyro bias is put right, which comes first, " if vertical is not None and vertical.acts else ""
+        advice = (
+            f"{first}either its world, north or mounting is another: `yaw_offset_rad = {offset:.3f}` under [heading] "
+            f"{IN_LOG_CONFIG}; or the Doppler log is turned on the vehicle: `dvl.mounting.rpy_rad = {rpy}` "
+            f"{IN_CALIBRATION}"
+        )
+    yield Finding(HEADING_TURN, in_degrees(angle), "°", advice, acts)
 
 
 def displacements(right: Sequence, stamps_ns: Ints, places: Floats, yaw_rad: Floats) -> tuple[Floats, Floats]:
@@ -158,8 +171,41 @@ def displacements(right: Sequence, stamps_ns: Ints, places: Floats, yaw_rad: Flo
     return np.diff(np.interp(ends, stamps_ns, places[:, 0] + 1j * places[:, 1])), reckoned
 
 
+def jumping_share(right: Sequence, fixes: PositionFixes) -> tuple[float, int]:
+    """Share of fixes from which the one `JUMP_NS` later is farther than the Doppler log moves, and their number.
+
+    With l the way by the Doppler log, in a gap at the log's high speed, a displacement Δ of length d is beyond it by
+    ``e = Δ (1 - l / d)``, and is no noise of the two fixes where ``eᵀ (C_i + C_j)⁻¹ e`` is above `JUMP_GATE`.
+    """
+    fixes = fixes.rows(np.flatnonzero(fixes.are_sound()))
+    is_measured = np.isfinite(right.dvl.velocity).all(axis=1)
+    stamps_ns, speed = right.dvl.stamps_ns[is_measured], np.linalg.norm(right.dvl.velocity[is_measured], axis=1)
+    steps_s = np.diff(stamps_ns) * 1e-9
+    mean_speed = np.where(
+        steps_s > right.calibration.dvl.gap_s, np.percentile(speed, HIGH_PERCENTILE), (speed[1:] + speed[:-1]) / 2
+    )
+    t = fixes.stamps_ns
+    way_m = np.interp(t, stamps_ns, np.concatenate([[0.0], np.cumsum(mean_speed * steps_s)]))
+    later = np.searchsorted(t, t + JUMP_NS)
+    i = np.flatnonzero((later < len(t)) & (t >= stamps_ns[0]))
+    i = i[t[later[i]] <= stamps_ns[-1]]
+    if not len(i):
+        return 0.0, 0
+    j = later[i]
+    moved = fixes.position_m[j] - fixes.position_m[i]
+    length = np.maximum(np.linalg.norm(moved, axis=1), 1e-9)
+    beyond = moved * np.maximum(0.0, 1 - (way_m[j] - way_m[i]) / length)[:, None]
+    noise = np.diag(np.square(right.calibration.positions.sigma_m))
+    cov_m2 = np.where(np.isnan(fixes.covariance_m2), noise, fixes.covariance_m2)
+    squares = np.einsum("ka,ka->k", beyond, np.linalg.solve(cov_m2[i] + cov_m2[j], beyond[:, :, None])[:, :, 0])
+    return float(np.mean(squares > JUMP_GATE)), len(i)
+
+
 def position_findings(right: Sequence, config: LogConfig) -> Iterator[Finding]:
-    """Unit of the position fixes, and their distance from the start or, where none is stated, from the origin."""
+    """Unit of the position fixes, jumps that no vehicle makes, and their distance from the start or the origin.
+
+    The origin where no start is stated.
+    """
     fixes, calibration = right.positions, right.calibration
     if fixes is None:
         return
@@ -181,6 +227,16 @@ def position_findings(right: Sequence, config: LogConfig) -> Iterator[Finding]:
             f"{unit}? {line} under [positions] {IN_LOG_CONFIG}"
         )
         yield Finding("position fixes: unit", replace(unknown, reason="wrong unit"), "", advice, acts=True)
+        return
+    share, count = jumping_share(right, fixes)
+    if share > LARGEST_JUMPING_SHARE and share * count >= FEWEST_WINDOWS:
+        of_all = Estimate1D(100 * share, 100 * float(np.sqrt(share * (1 - share) / count)))
+        advice = (
+            f"fixes {JUMP_NS / NS_PER_S:.0f} s apart are farther from each other than the vehicle moves by its Doppler "
+            f"log and their noise allows: angles, or of another thing? `use = false` under [positions] {IN_LOG_CONFIG} "
+            f"leaves them out; or they are worse than `positions.sigma_m` {IN_CALIBRATION}"
+        )
+        yield Finding("position fixes: jumps", of_all, "%", advice, acts=True)
         return
     near = np.median(fixes.position_m[np.argsort(np.abs(fixes.stamps_ns - right.start_ns))[:FEWEST_WINDOWS]], axis=0)
     start = np.array(calibration.start.position_m)

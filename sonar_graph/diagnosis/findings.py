@@ -10,8 +10,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from sonar_graph.calibration import Calibration, ImuCalibration, Start
+from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Start
 from sonar_graph.errors import AlignmentError
 from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Heading, Imu
 from sonar_graph.navigation.alignment import (
@@ -170,6 +171,13 @@ def _arm_and_error(found: DvlMatch, calibration: Calibration) -> tuple[Floats, F
     given = np.subtract(calibration.dvl.mounting.translation_m, calibration.imu.mounting.translation_m)
     errors = [replace(e, value=e.value - g) for e, g in zip(found.lever, given.tolist(), strict=True)]
     return given, np.array([error.value if matters(error, LEAST_LEVER_M) else 0.0 for error in errors])
+
+
+def turned_mounting(dvl: DvlCalibration, yaw_rad: float) -> tuple[float, float, float]:
+    """Roll, pitch and yaw of the mounting after a turn about the body's z axis."""
+    before = Rotation.from_euler("ZYX", dvl.mounting.rpy_rad[::-1])
+    yaw, pitch, roll = (Rotation.from_euler("z", yaw_rad) * before).as_euler("ZYX").tolist()
+    return roll, pitch, yaw
 
 
 def numbers(values: Iterable[float], digits: int) -> str:

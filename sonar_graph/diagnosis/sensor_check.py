@@ -12,13 +12,12 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.ndimage import median_filter
-from scipy.spatial.transform import Rotation
 
-from sonar_graph.calibration import DvlCalibration, Start
+from sonar_graph.calibration import Start
 from sonar_graph.diagnosis.aiding_check import (
     HEADING_SENSE,
+    HEADING_TURN,
     heading_findings,
-    heading_sense,
     position_findings,
     vertical_bias,
 )
@@ -36,6 +35,7 @@ from sonar_graph.diagnosis.findings import (
     matters,
     numbers,
     tilt_findings,
+    turned_mounting,
     with_fitted,
 )
 from sonar_graph.logs.adapters import LogConfig
@@ -117,14 +117,16 @@ def wrong_units(sequence: Sequence, config: LogConfig) -> list[Finding]:
 def doubts(sequence: Sequence, config: LogConfig) -> list[Finding]:
     """Findings to act on that a run can tell at once: wrong units, else heading, gyro bias, unit and place of fixes.
 
-    What needs a Doppler log that is put right (`check_sensors`) is left to ``inspect``.
+    A heading too that is turned against known positions by more than `LARGE_TURN_RAD`. What needs a Doppler log that is
+    put right (`check_sensors`) is left to ``inspect``, where these are warnings.
     """
     if faults := wrong_units(sequence, config):
         return faults
-    heading = sequence.heading
-    senses = [] if heading is None else [heading_sense(sequence, heading, config)]
-    if not any(sense.acts for sense in senses) and (vertical := vertical_bias(sequence)) is not None:
-        senses.append(vertical)
+    senses = list(heading_findings(sequence, config))
+    large = np.degrees(LARGE_TURN_RAD)
+    senses = [f for f in senses if f.quantity != HEADING_TURN or abs(f.estimate.value) > large]
+    if not any(f.quantity == HEADING_SENSE and f.acts for f in senses) and (vertical := vertical_bias(sequence)):
+        senses = [vertical, *senses]
     return [finding for finding in (*senses, *position_findings(sequence, config)) if finding.acts]
 
 
@@ -196,6 +198,8 @@ LEAST_YAW_RAD = np.radians(0.25)
 LEAST_SCALE = 0.002
 LEAST_HEADING_RAD = np.radians(1.0)
 """Smaller errors are hidden by others."""
+LARGE_TURN_RAD = np.radians(10.0)
+"""Of the heading against positions: beyond, a run's result is of little worth."""
 LARGEST_DENSITY_RATIO = 1.5
 """Ratio to the calibration's density, either way, from which on a line is advised."""
 LARGEST_RESTING_M_S = 0.1
@@ -250,7 +254,7 @@ def dvl_findings(found: DvlMatch, sequence: Sequence, config: LogConfig) -> list
     scales = matters(replace(found.scale, value=found.scale.value - 1), LEAST_SCALE)
     yaw_advice = scale_advice = NO_NEED
     if turns:
-        rpy = numbers(_turned(sequence.calibration.dvl, found.yaw.value), 4)
+        rpy = numbers(turned_mounting(sequence.calibration.dvl, found.yaw.value), 4)
         yaw_advice = f"turn the DVL's mounting: `dvl.mounting.rpy_rad = {rpy}` {IN_CALIBRATION}"
     if scales:
         scale = config.number("dvl", "scale", 1.0) * found.scale.value
@@ -269,7 +273,7 @@ def corrected_sequence(sequence: Sequence, match: DvlMatch, of_dvl: list[Finding
     shift_ns = round(match.offset.value * NS_PER_S) if late else 0
     velocity = dvl.velocity * (match.scale.value if scaled else 1.0)
     if turned:
-        rpy = _turned(calibration.dvl, match.yaw.value)
+        rpy = turned_mounting(calibration.dvl, match.yaw.value)
         mounting = calibration.dvl.mounting.model_copy(update={"rpy_rad": rpy})
         section = calibration.dvl.model_copy(update={"mounting": mounting})
         calibration = calibration.model_copy(update={"dvl": section})
@@ -339,10 +343,3 @@ def _offset(quantity: str, offset: Estimate1D, imu: Imu, role: str, config: LogC
     acts = matters(offset, LEAST_OFFSET_S)
     advice = f"shift its stamps: `stamp_offset_s = {total_s:.3f}` under [{role}] {IN_LOG_CONFIG}"
     return Finding(f"{quantity}: time offset", offset, "s", advice if acts else NO_NEED, acts), offset
-
-
-def _turned(dvl: DvlCalibration, yaw_rad: float) -> tuple[float, float, float]:
-    """Roll, pitch and yaw of the mounting after a turn about the body's z axis."""
-    before = Rotation.from_euler("ZYX", dvl.mounting.rpy_rad[::-1])
-    yaw, pitch, roll = (Rotation.from_euler("z", yaw_rad) * before).as_euler("ZYX").tolist()
-    return roll, pitch, yaw

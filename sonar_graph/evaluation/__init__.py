@@ -15,12 +15,12 @@ from sonar_graph.evaluation.scored_instants import (DURATION_S, MAP_TIMES_S, RET
     repeats_published)
 from sonar_graph.evaluation.scores import ESTIMATES
 from sonar_graph.evaluation.storage import read_comparison, write_comparison, write_viewer_files, result_names
-from sonar_graph.evaluation.tables import (FITTED, HEADLINES, LABELS, SCORES, compact_table, headline_metric, label,
-    run_columns, score_keys, score_table, unaligned)
+from sonar_graph.evaluation.tables import (FITTED, HEADLINES, HEIGHTS, LABELS, SCORES, compact_table, headline_metric,
+    label, run_columns, score_keys, score_table, unaligned)
 __all__ = [
-    "Comparison", "DURATION_S", "ESTIMATES", "Ensemble", "ErrorSeries", "FITTED", "GATED_SHARE", "HEADLINES", "LABELS",
-    "LIBRARIES", "MAP_TIMES_S", "MOST_ROWS_NAMED", "NONE", "RETURN_M", "RefusedRows", "Reliability", "RunResult",
-    "SCORES", "Score", "UNJUDGED", "anees_interval", "between", "check_request", "compact_table",
+    "Comparison", "DURATION_S", "ESTIMATES", "Ensemble", "ErrorSeries", "FITTED", "GATED_SHARE", "HEADLINES", "HEIGHTS",
+    "LABELS", "LIBRARIES", "MAP_TIMES_S", "MOST_ROWS_NAMED", "NONE", "RETURN_M", "RefusedRows", "Reliability",
+    "RunResult", "SCORES", "Score", "UNJUDGED", "anees_interval", "between", "check_request", "compact_table",
     "compare", "confidences", "describe_environment", "expense", "fixed", "format_value", "gathered",
     "headline_metric", "judge", "label", "landmark_errors", "map_instants", "nis", "normalised_squares", "one_line",
     "own_map_errors", "published_maps", "quantile_text", "read_comparison", "reliability_of", "repeats_published",

@@ -5,6 +5,7 @@ import platform
 import shlex
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import lru_cache, partial
 from importlib.metadata import version
@@ -27,7 +28,7 @@ from sonar_graph.evaluation.scores import (
     resource_scores,
     trajectory_scores,
 )
-from sonar_graph.evaluation.tables import FITTED, unaligned
+from sonar_graph.evaluation.tables import FITTED, HEIGHTS, NO_HEIGHTS, unaligned
 from sonar_graph.files import spelt
 from sonar_graph.measurements import Ints
 from sonar_graph.sequence import Sequence, require_sequence
@@ -163,6 +164,10 @@ def judge(sequence: Sequence, instants_ns: Ints, runs: list[RunResult]) -> Compa
     """Score runs that were all asked for estimates at these instants, shape (n,)."""
     environment = describe_environment()
     sequence = with_fitted_truth(sequence, instants_ns, runs)
+    true = sequence.truth  # heights that nobody measured are all alike; true poses of a dive may be as well
+    is_flat = true is not None and len(true) > 1 and not true.has_orientation and not np.ptp(true.positions[:, 2])
+    if is_flat:
+        sequence = replace(sequence, notes={**sequence.notes, HEIGHTS: NO_HEIGHTS})
     errors: dict[str, dict[Kind, ErrorSeries]] = {}
     scores: dict[str, dict[str, Score]] = {run.estimator: {} for run in runs}
     ended = [run for run in runs if run.status != "failed"]
@@ -183,7 +188,7 @@ def judge(sequence: Sequence, instants_ns: Ints, runs: list[RunResult]) -> Compa
         environment["scored instants"] += ": too few for any trajectory error"
         return comparison
     truth = sequence.truth.at(scored.stamps_ns)
-    position_dof = 3 if sequence.calibration.planar is None else 2
+    position_dof = 3 if sequence.calibration.planar is None and not is_flat else 2
     for run in runs:
         errors[run.estimator] = {}
         if run not in ended or run.causal is None or run.smoothed is None:
@@ -191,8 +196,13 @@ def judge(sequence: Sequence, instants_ns: Ints, runs: list[RunResult]) -> Compa
         both: dict[Kind, Trajectory] = {"causal": run.causal, "smoothed": run.smoothed}
         for kind, trajectory in both.items():
             estimate = rows_at(trajectory, scored.stamps_ns)
+            if is_flat:
+                z_m = truth.positions[:, 2]
+                estimate = replace(estimate, positions=np.column_stack([estimate.positions[:, :2], z_m]))
             series = errors[run.estimator][kind] = error_series(estimate, truth, position_dof)
-            scores[run.estimator] |= trajectory_scores(kind, estimate, truth, series, str(scored), unaligned(sequence))
+            scores[run.estimator] |= trajectory_scores(
+                kind, estimate, truth, series, str(scored), unaligned(sequence), has_height=not is_flat
+            )
     map_instants_ns = shared_map_instants(ended, sequence, scored.stamps_ns)
     for run in ended:
         scores[run.estimator] |= own_map_scores(run, sequence, map_instants_ns)

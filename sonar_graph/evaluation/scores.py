@@ -50,20 +50,29 @@ IN_TIME = (
 
 
 def trajectory_scores(
-    kind: Kind, estimate: Trajectory, truth: Trajectory, errors: ErrorSeries, instants: str, world: str
+    kind: Kind,
+    estimate: Trajectory,
+    truth: Trajectory,
+    errors: ErrorSeries,
+    instants: str,
+    world: str,
+    *,
+    has_height: bool = True,
 ) -> dict[str, Score]:
     """Accuracy and consistency of one trajectory, under keys that begin with its kind.
 
     Estimate, truth and errors are at the scored instants; ``instants`` has these in words, for the protocols, and
     ``world`` is `unaligned`. Scores that need true orientations are left out where the truth has positions only.
+    Without ``has_height`` the estimate has the truth's, and its errors are of x and y.
     """
     which, over = ESTIMATES[kind], f"over {instants}, to which the truth is interpolated"
+    space = f"{'3-D' if has_height else 'horizontal'} position error"
     fitted = "without scale (Umeyama 1991), fitted to these instants: rms of"
     rules = [
-        ("ate_raw_m", ate_raw_m(estimate, truth), "m", f"{world}: rms of 3-D position error"),
-        ("ate_yaw_m", ate_yaw_m(estimate, truth), "m", f"aligned by yaw and translation {fitted} 3-D position error"),
+        ("ate_raw_m", ate_raw_m(estimate, truth), "m", f"{world}: rms of {space}"),
+        ("ate_yaw_m", ate_yaw_m(estimate, truth), "m", f"aligned by yaw and translation {fitted} {space}"),
         ("ate_se2_m", ate_se2_m(estimate, truth), "m", f"aligned by SE(2) {fitted} horizontal position error"),
-        ("ate_se3_m", ate_se3_m(estimate, truth), "m", f"aligned by SE(3) {fitted} 3-D position error"),
+        ("ate_se3_m", ate_se3_m(estimate, truth), "m", f"aligned by SE(3) {fitted} {space}"),
         ("yaw_rmse_rad", rmse(yaw_errors_rad(estimate, truth)), "rad", f"{world}: rms of wrapped heading error"),
         ("return_error_m", return_error_m(estimate, truth), "m",
          f"{world}: norm of estimated minus true displacement from the first to the last,"),

@@ -12,6 +12,8 @@ if TYPE_CHECKING:
 
 FITTED = "truth.world"
 """Note of a sequence whose truth was brought into the world of the estimates."""
+HEIGHTS, NO_HEIGHTS = "truth.height", "its heights are all alike, so not measured: errors and NEES are of x and y"
+"""Note of a sequence whose truth has positions without heights."""
 NOT_ALIGNED = "not aligned"
 
 TRAJECTORY_LABELS = {

@@ -171,7 +171,7 @@ def render_report(comparison: Comparison) -> str:
         "has_true_landmarks": sequence.true_landmarks is not None,
         "nameless": sentences.nameless_landmarks(comparison),
         "paper": PAPER if is_repeated else "",
-        "detections": detections,
+        "has_detections": detections > 0 or bool(outcome_table(comparison).rows),
         "outcomes": outcome_table(comparison),
         "refused": refused_table(comparison),
         "recognition": recognition_content(comparison),

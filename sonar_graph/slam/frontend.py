@@ -64,7 +64,7 @@ class Frontend:
             self.update_if_due()
 
     def add_fix(self, stamp_ns: int, position_m: Floats, cov_m2: Floats) -> None:
-        """Take in a position fix, which enters the estimate at once."""
+        """Take in a position fix, which enters the estimate at once unless it has next to nothing to tell."""
         self._keyframes.add_fix(stamp_ns, position_m, cov_m2)
         self.update_if_due()
 

@@ -320,8 +320,11 @@ class Isam2:
         return self._sightings.log()
 
     def withheld(self) -> list[str]:
-        """Newest factors that could not be used, a line each: the variable, its factors and what was missing."""
-        return list(self._smoother.withheld)
+        """What could not be used, a line each: headings and fixes that the estimate contradicts, then newest factors.
+
+        Of these the variable, the factors and what was missing.
+        """
+        return [*self._keyframes.contradictions.messages(), *self._smoother.withheld]
 
     def refused_rows(self) -> list[RefusedRow]:
         """Rows of all sensors but the sonar that are not used, and why."""

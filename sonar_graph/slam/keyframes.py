@@ -9,6 +9,7 @@ before it, by the motion between them; a late one on that of its time, while tha
 """
 
 from bisect import bisect_left, bisect_right
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -24,7 +25,7 @@ from sonar_graph.motion import MotionSource, PreintegratedMotion
 from sonar_graph.navigation.alignment import gravity_direction
 from sonar_graph.numerics import cross_matrix
 from sonar_graph.slam.biases import BIASES, COMPASS, HEADING, TILT, bias_sigmas, by_biases, gyro_bias_of
-from sonar_graph.slam.models import HUBER_WIDTHS, OdometryWithBias, factors
+from sonar_graph.slam.models import HUBER_WIDTHS, Contradictions, OdometryWithBias, factors
 from sonar_graph.slam.smoother import Changed, Smoother
 from sonar_graph.states import Refusal, RefusedRow
 
@@ -33,6 +34,9 @@ CARRIED_IN_GAP_NS = 300_000_000
 """Longest time over which a sample of depth or heading is carried straight on over the end of a gap."""
 LONGEST_LATE_NS = 60_000_000_000
 """Age of a position fix up to which rows for it are kept, where the window is longer."""
+FIX_GAIN = 50.0
+"""Weight of what a position fix has to tell beside what a sighting has: with the default ``waiting_gain`` of 5, fixes
+that would take less than a tenth of the position's variance together wait for the next keyframe."""
 EARLIEST_NS, LATEST_NS = np.iinfo(np.int64).min, np.iinfo(np.int64).max
 
 
@@ -96,6 +100,9 @@ class Keyframes:
         self._newest_heading_ns, self._reached_ns = EARLIEST_NS, LATEST_NS
         self._told = 0
         self._refused: list[RefusedRow] = []
+        self.contradictions = Contradictions()
+        """Headings and fixes that the estimate contradicts at the keyframe after theirs."""
+        self._unjudged: list[tuple[str, Callable[[gtsam.Values], Floats]]] = []
 
     @property
     def newest_ns(self) -> int | None:
@@ -248,6 +255,9 @@ class Keyframes:
 
     def _set(self, node_ns: int, known_ns: int) -> None:
         """Set a keyframe at an epoch that is reached at an instant."""
+        for sensor, distances in self._unjudged:
+            self.contradictions.judge(sensor, distances(self.smoother.values))
+        self._unjudged.clear()
         i, j = len(self.stamps_ns) - 1, len(self.stamps_ns)
         start_ns, bias, world_T_i = self.stamps_ns[-1], self.bias(i), self.smoother.values.atPose3(X(i))
         attitude = world_T_i.rotation().matrix()
@@ -350,8 +360,18 @@ class Keyframes:
         key = self.bias_keys[-1]
         self.smoother.add({"heading": factors.heading(X(j), key, measured, mean_variance**0.5)})
 
+        def distances(values: gtsam.Values) -> Floats:
+            x, y, _ = values.atPose3(X(j)).matrix()[:3, 0]
+            off = wrapped(missed + compass_rad + yaw_rad[-1] - np.arctan2(y, x))
+            return np.asarray(np.abs(off) / np.hypot(sigma, self.calibration.heading.bias_sigma_rad))
+
+        self._unjudged.append(("heading", distances))
+
     def add_fix(self, stamp_ns: int, position_m: Floats, cov_m2: Floats) -> None:
-        """Hang a position fix on the keyframe before it; refuse one before the window, or before rows that are kept."""
+        """Hang a position fix on the keyframe before it; refuse one before the window, or before rows that are kept.
+
+        It enters the estimate at once, unless it has next to nothing to tell (`FIX_GAIN`).
+        """
         i = bisect_right(self.stamps_ns, stamp_ns) - 1
         if i < 0 or self.stamps_ns[i] < self.stamps_ns[-1] - self._lag_ns or not self.smoother.in_window([X(i)]):
             self.refuse("positions", stamp_ns, Refusal.LATE)
@@ -365,8 +385,19 @@ class Keyframes:
         antenna = np.array(self.calibration.positions.antenna_m)
         by_motion = R_i @ motion.i_T_j.rotation().matrix() @ np.hstack((-cross_matrix(antenna), np.eye(3)))
         cov_m2 = cov_m2 + by_motion @ motion.covariance @ by_motion.T
-        factor = factors.position(X(i), position_m, motion.i_T_j.transformFrom(antenna), cov_m2)
-        self.smoother.add({"position": factor}, gain=np.inf)
+        arm, gain = motion.i_T_j.transformFrom(antenna), np.inf
+        factor = factors.position(X(i), position_m, arm, cov_m2)
+        if i == len(self.stamps_ns) - 1 and not self.smoother.is_due:
+            by_pose = R_i @ np.hstack((-cross_matrix(arm), np.eye(3)))
+            predicted = by_pose @ self.smoother.joint_covariance([X(i)]).at(X(i), X(i)) @ by_pose.T
+            gain = FIX_GAIN * float((predicted.diagonal() / cov_m2.diagonal()).max())
+        self.smoother.add({"position": factor}, gain=gain)
+
+        def distance(values: gtsam.Values) -> Floats:
+            e = values.atPose3(X(i)).transformFrom(arm) - position_m
+            return np.sqrt(e @ np.linalg.solve(cov_m2, e))
+
+        self._unjudged.append(("positions", distance))
 
     def _constrain(self, j: int) -> None:
         if self.calibration.planar:

@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sonar_graph.errors import LogError
 from sonar_graph.logs import write_log
+from sonar_graph.logs.convert import read_csv
 from sonar_graph.measurements import Dvl
 from sonar_graph.states import Trajectory
 from sonar_graph.testing import small_world
@@ -61,6 +63,9 @@ def folder(tmp_path_factory) -> Path:
         "key": IMU + DVL + 'units = "mm/s"\n',
         "unit": IMU + DVL + 'scale = "furlongs"\n',
         "topic": IMU + DVL + 'topic = "/dvl"\n',
+        "close_unit": IMU + DVL + 'scale = "cm/sec"\n',
+        "number": IMU + DVL.replace('"vx"', "44"),
+        "upper": IMU + DVL.replace("dvl.csv", "DVL.csv"),
     }
     for name, text in configurations.items():
         (path / f"{name}.toml").write_text(text)
@@ -80,9 +85,12 @@ WRONG = {
     "convert csv absent.csv --config good.toml -o new.mcap": r"absent\.csv",
     "convert csv imu.csv dvl.csv -o new.mcap": r"--config is missing; `.* csv imu\.csv dvl\.csv --toml > dive",
     "convert csv imu.csv dvl.csv --config good.toml": "-o is missing",
-    "convert csv imu.csv --config good.toml -o new.mcap": r"\[dvl\] file: dvl\.csv is not among the tables; .*imu\.csv",
+    "convert csv imu.csv --config good.toml -o new.mcap": r"dvl\.csv is not among the tables; add dvl\.csv to the comm",
     f"{CSV} no_dvl.toml": r"no_dvl\.toml: has no table \[dvl\]; every estimator needs IMU and Doppler log",
-    f"{CSV} truth.toml": r"truth\.csv is not among the tables",
+    f"{CSV} truth.toml": r"truth\.csv is not among the tables; add truth\.csv to the command",
+    f"{CSV} upper.toml": r"DVL\.csv is not among the tables; did you mean 'dvl\.csv'[?]",
+    f"{CSV} number.toml": r"dvl\.csv: has no column 44 \(\[dvl\] velocity\); it has 4, numbered from 1$",
+    f"{CSV} close_unit.toml": r"\[dvl\] scale: did you mean cm/s[?] expected a factor or one of the units m/s, cm/s",
     f"{CSV} half.toml": r"half\.toml: \[dvl\] velocity: expected 3 values",
     f"{CSV} column.toml": r"imu\.csv: has no column 'gyro_x' \(\[imu\] angular_velocity\); it has time, wx, wy, wz",
     f"{CSV} role.toml": r"there is no role \[dlv\]; did you mean \[dvl\][?]",
@@ -99,6 +107,9 @@ WRONG = {
     f"{CSV} gap.toml": "no common time; of another clock or unit[?] See stamp, stamp_unit_s and stamp_offset_s",
     "convert csv . --config good.toml -o wall/new.mcap": r"wall/new\.mcap: cannot be written: .*choose another place",
     "convert csv . --config good.toml -o new.csv": r"logs are MCAP files",
+    "inspect dive.mcap --log-config good.toml": r"good\.toml: says which text tables .* csv TABLES --config good\.toml",
+    "compare imu.csv -o out": r"a text that begins with 'time,wx.*text tables by `sonar-graph convert csv`",
+    "view dive.mcap --viewer browser": r"dive\.mcap: is a log, .* `sonar-graph compare dive\.mcap -o DIR` makes",
     "inspect bag": r"lost_0\.mcap",
     "compare dive.mcap -o wall": "wall: is a file; give a folder",
     "compare dive.mcap -o out --calibration imu.csv": r"imu\.csv: not TOML",
@@ -121,6 +132,28 @@ def test_times_that_run_backwards_are_sorted_and_named(run, folder, tmp_path, ca
     words = "convert", "csv", folder, "--config", folder / "late.toml", "-o", tmp_path / "late.mcap"
     assert run(*words) == 0
     assert re.search(r"warning: imu: 2 times backwards, by .* rows are sorted", capsys.readouterr().err)
+
+
+def test_a_truth_of_tables_may_take_its_orientation_away_as_one_of_messages_may(folder, tmp_path):
+    world = small_world()
+    truth = ["time,x,y,z", *rows(world.truth.stamps_ns, world.truth.positions)]
+    (tmp_path / "truth.csv").write_text("\n".join(truth) + "\n")
+    (tmp_path / "dive.toml").write_text(IMU + DVL + TRUTH + "orientation = false\n")
+    tables = [folder / "imu.csv", folder / "dvl.csv", tmp_path / "truth.csv"]
+    found = read_csv(tables, tmp_path / "dive.toml").truth
+    assert (len(found), found.has_orientation) == (len(world.truth), False)
+    (tmp_path / "dive.toml").write_text(IMU + DVL + TRUTH + "orientations = false\n")
+    with pytest.raises(LogError, match="orientations: there is no such field"):
+        read_csv(tables, tmp_path / "dive.toml")
+
+
+def test_tables_with_velocities_in_another_unit_are_named_when_they_are_converted(run, folder, tmp_path, capsys):
+    (tmp_path / "dive.toml").write_text(IMU + DVL + "scale = 1000\n")
+    assert run("convert", "csv", folder, "--config", tmp_path / "dive.toml", "-o", tmp_path / "new.mcap") == 0
+    said = capsys.readouterr().err
+    assert re.search(r"warning: DVL: unit: velocities look 1000 times too large .*`scale = 0\.001` .*dive\.toml", said)
+    assert run("convert", "csv", folder, "--config", folder / "good.toml", "-o", tmp_path / "good.mcap") == 0
+    assert "unit" not in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", ["run", "compare"])

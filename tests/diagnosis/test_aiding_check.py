@@ -110,6 +110,24 @@ def test_fixes_in_a_map_grid_are_named_with_the_origin_that_brings_them_to_the_s
     ]
 
 
+@pytest.mark.parametrize("every_s", [0.1, 1.0, 30.0])
+def test_fixes_that_no_vehicle_can_follow_are_named_and_outliers_among_good_ones_are_not(every_s: float):
+    good = fixed(SLOW if every_s < 30 else RIGHT, sigma_m=2.5, every_s=every_s)
+    places = good.positions.position_m
+    yaw_deg = np.degrees(np.interp(good.positions.stamps_ns, good.truth.stamps_ns, yaw_of(good)))
+    angles = np.column_stack([0 * yaw_deg, 0 * yaw_deg, 10 * yaw_deg])
+    spikes = places + 500.0 * (np.arange(len(places)) % 20 == 3)[:, None]
+    for wrong, is_named in ((places, False), (spikes, False), (angles, True)):
+        given = replace(good, positions=replace(good.positions, position_m=wrong))
+        found = [f.quantity for f in aiding_check.position_findings(given, NO_CONFIG) if f.acts]
+        assert ("position fixes: jumps" in found) == is_named, (found, every_s)
+        assert [f.quantity for f in doubts(given, NO_CONFIG) if "jumps" in f.quantity] == found
+
+
+def yaw_of(run: Sequence) -> np.ndarray:
+    return np.unwrap(run.truth.rotations().as_euler("ZYX")[:, 0])
+
+
 @pytest.mark.parametrize("places", ["fixes", "true positions", "neither"])
 def test_a_heading_of_another_world_is_told_by_positions_with_the_offset_that_puts_it_right(places: str):
     """A Doppler log that is turned on the body is no turn of the heading."""
@@ -138,8 +156,24 @@ def test_a_heading_of_another_world_is_told_by_positions_with_the_offset_that_pu
         assert finding.acts == wrong
         if wrong:
             assert line_of(finding) == pytest.approx({"yaw_offset_rad": before - off_rad}, abs=0.04)
+            cure = tomllib.loads(finding.advice.split("`")[3])["dvl"]["mounting"]["rpy_rad"]
+            assert cure == pytest.approx([0.0, 0.0, 0.7 - off_rad], abs=0.04)
+            turned = with_mounting(run, "dvl", rpy_rad=cure)
+            assert not [f for f in aiding_check.heading_findings(turned, config) if f.acts]
+            assert finding.quantity in [f.quantity for f in doubts(run, config)]
     still = replace(run, dvl=replace(run.dvl, velocity=0 * velocity))
     assert not any(f.estimate.is_known for f in list(aiding_check.heading_findings(still, LogConfig()))[1:])
+
+
+@pytest.mark.parametrize(("off_deg", "gyro_bias"), [(6.0, 0.0), (20.0, 0.0), (20.0, 0.01)])
+def test_a_turned_heading_is_a_warning_beyond_ten_degrees_and_a_gyro_bias_comes_first(off_deg, gyro_bias):
+    imu = replace(RIGHT.imu, angular_velocity=RIGHT.imu.angular_velocity + np.array([0.0, 0.0, gyro_bias]))
+    run = compass(replace(RIGHT, imu=imu), lambda yaw_rad: yaw_rad + np.radians(off_deg))
+    found = doubts(run, NO_CONFIG)
+    turned = [f for f in found if f.quantity == "heading: turn towards the positions"]
+    assert [f.acts for f in turned] == [True] * (off_deg > 10)
+    assert ["gyro bias is put right, which comes first" in f.advice for f in turned] == [gyro_bias > 0] * len(turned)
+    assert not turned or found[-1] == turned[0]
 
 
 @pytest.mark.parametrize("upside_down", [False, True])

@@ -86,7 +86,9 @@ def test_scores_of_a_constant_offset_by_hand_each_with_unit_and_protocol(install
 def test_truth_with_positions_only_scores_positions_alone(install):
     """Nothing that needs a true orientation is scored, drawn or summed up; what is scored has the same value."""
     whole = straight_sequence()
-    positions = replace(whole, truth=Trajectory.of_positions(whole.truth.stamps_ns, whole.truth.positions))
+    climbing = whole.truth.positions + np.linspace(0.0, 1e-3, len(whole.truth))[:, None] * [0, 0, 1]
+    whole = replace(whole, truth=replace(whole.truth, positions=climbing))
+    positions = replace(whole, truth=Trajectory.of_positions(whole.truth.stamps_ns, climbing))
     settings = {"offset": {"offset_m": 0.4, "sigma_m": 0.1}}
     full, partial = (compare(sequence, ["offset"], settings) for sequence in (whole, positions))
     lacking = {
@@ -100,6 +102,23 @@ def test_truth_with_positions_only_scores_positions_alone(install):
         if not key.startswith(("time", "memory")):
             assert score.value == full.scores["offset"][key].value, key
     assert np.isnan(partial.errors["offset"]["causal"].yaw_rad).all()
+
+
+def test_of_a_truth_whose_heights_nobody_measured_x_and_y_alone_count(install):
+    whole = straight_sequence()
+    level = whole.truth.positions * [1.0, 1.0, 0.0] + [0.0, 0.0, 7.0]
+    flat = replace(whole, truth=Trajectory.of_positions(whole.truth.stamps_ns, level))
+    judged = compare(flat, ["offset"], {"offset": {"offset_m": 0.4, "sigma_m": 0.1}})
+    errors, scores = judged.errors["offset"]["causal"], judged.scores["offset"]
+    assert errors.position_dof == 2
+    np.testing.assert_array_equal(errors.position_m[:, 2], 0.0)
+    off = np.hypot(*errors.position_m[:, :2].T)
+    assert scores["causal.ate_raw_m"].value == pytest.approx(np.sqrt(np.mean(off**2)))
+    assert "rms of horizontal position error" in scores["causal.ate_raw_m"].protocol
+    assert "position (x and y)" in scores["causal.nees_position"].protocol
+    assert "not measured: errors and NEES are of x and y" in judged.sequence.notes["truth.height"]
+    for known in (whole, replace(flat, truth=replace(flat.truth, positions=level + np.arange(len(level))[:, None]))):
+        assert "truth.height" not in compare(known, ["offset"]).sequence.notes
 
 
 def test_ignored_detections_are_neither_used_nor_refused():

@@ -69,6 +69,7 @@ def test_scores_nobody_foresaw_are_shown_too_and_doubts_about_a_log_stand_at_the
     top = html[: html.index('class="summary"')]
     assert "Warning: imu: no sample 3.000 to 9.000 s after the start" in top
     assert "5 of 5 rows" not in top
+    assert html.index('href="#warnings">1 warning</a>') < html.index('class="headline"') < html.index('id="figure-map"')
 
 
 def test_a_failed_run_is_named_first_with_its_reason_escaped(comparison):
@@ -107,11 +108,14 @@ def test_page_is_whole_whatever_is_missing(comparison, change):
 def test_without_landmarks_no_figure_of_them_is_announced(comparison):
     alone = only(comparison, "dead-reckoning")
     blind = replace(alone, sequence=replace(alone.sequence, detections=None))
-    for shown, said in ((alone, "No run reports what became of"), (blind, "The log has no landmark detections.</p>")):
+    unmapped = replace(blind, sequence=replace(blind.sequence, true_landmarks=None))
+    for shown, is_announced in ((alone, True), (blind, False), (unmapped, False)):
         html = render_report(shown)
         figures = re.findall(r'<figure id="figure-(\w+)"', html)
         assert figures == ["map", "errors", "bounds", "own_map", "yaw", "nees", "timing"]
-        assert html.count(said) == 1
+        assert html.count("No run reports what became of") == html.count('<a href="#detections">') == is_announced
+        assert ("Ellipses hold" in html) == (shown is not unmapped)
+    assert "The log has no landmark detections" in html
     assert {"growth", "innovations", "nis"} <= set(re.findall(r'<figure id="figure-(\w+)"', render_report(comparison)))
 
 

@@ -92,11 +92,10 @@ def test_a_comparison_shows_its_sentence_and_the_whole_map_on_the_first_screen(b
         assert page.evaluate("document.querySelector('.headline').textContent").startswith(
             "isam2 is nearest to the truth"
         )
-        assert (
-            0
-            < page.evaluate(box.format(".headline") + ".bottom")
-            < page.evaluate(box.format("#figure-map svg") + ".top")
-        )
+        beside = page.evaluate(box.format(".headline") + ".left") > page.evaluate(box.format("#figure-map") + ".right")
+        assert beside == (width == DESKTOP)
+        bottom = page.evaluate(box.format(".headline") + ".bottom")
+        assert 0 < bottom < (900 if beside else page.evaluate(box.format("#figure-map svg") + ".top"))
         assert page.evaluate(box.format("#figure-map svg") + ".bottom") <= 900
         assert page.evaluate(box.format("#figure-map svg") + ".right") <= width
         ink, paper = page.evaluate(

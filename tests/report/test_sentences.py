@@ -280,7 +280,7 @@ def test_a_landmark_that_its_covariance_rules_out_is_named_with_the_policy():
     assert sentences.doubt_of_identities(comparison) == [line]
     assert line in printed(comparison, 200)
     page = render_report(comparison)
-    assert page.index("puts landmark 3 far outside") < page.index("<nav")
+    assert page.index("puts landmark 3 far outside") < page.index('<h2 id="numbers">')
 
 
 def test_without_true_landmarks_the_innovations_of_used_detections_tell():
@@ -405,7 +405,7 @@ def test_terminal_and_page_say_what_was_refused_and_withheld_and_nothing_where_n
     assert sentences.withheld_lines(comparison) == [line]
     below, page = printed(comparison, 200), render_report(comparison)
     assert all(line in below for line in [*sentences.refusal_lines(comparison), line])
-    assert page.index(line) < page.index("<nav")
+    assert page.index(line) < page.index('<h2 id="numbers">')
     section = page[page.index('<h2 id="refused">') : page.index('<h2 id="time">')]
     for word in ("dvl", "1.000", Refusal.OUTLIER, "513", "imu", "0.000", Refusal.LATE, "isam2"):
         assert word in section

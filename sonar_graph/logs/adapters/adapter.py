@@ -7,6 +7,7 @@ and conventions. A message type is added without code, as an instance of that su
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from difflib import get_close_matches
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
@@ -74,7 +75,9 @@ def _from_units(units: Mapping[str, float]) -> BeforeValidator:
 
     def factor(value: object) -> object:
         if isinstance(value, str) and value not in units:
-            raise ValueError(f"expected a factor or one of the units {', '.join(units)}")
+            close = get_close_matches(value, units, 1)
+            meant = f"did you mean {close[0]}? " if close else ""
+            raise ValueError(f"{meant}expected a factor or one of the units {', '.join(units)}")
         return units[value] if isinstance(value, str) else value
 
     return BeforeValidator(factor)

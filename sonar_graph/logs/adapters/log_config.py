@@ -63,6 +63,13 @@ class LogConfig:
         A LogError names the source, the table and the key, and what was expected.
         """
         for role, table in values.items():
+            if isinstance(table, Mapping) and "file" in table:
+                raise LogError(
+                    f"{source}: says which text tables are what ([{role}] file), not what the topics of a log are: "
+                    f"give it to `sonar-graph convert csv TABLES --config {source} -o OUT.mcap`; a log made by it "
+                    f"needs a log configuration only for what is still to be changed"
+                )
+        for role, table in values.items():
             if role not in ADAPTERS:
                 raise LogError(f"{source}: there is no role [{role}]; tables are for {', '.join(ADAPTERS)}")
             if not isinstance(table, Mapping):

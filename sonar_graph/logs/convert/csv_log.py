@@ -101,7 +101,12 @@ def parse_csv_config(values: Mapping[str, Any], source: str) -> dict[str, CsvRol
 
 def _role(role: str, table: dict[str, Any], source: str) -> CsvRole:
     kind = CSV_ADAPTERS[role]
-    said = {key: _as_names(kind, key, value) for key, value in table.items()}
+    base = kind.model_construct(type="csv")
+    said = {
+        key: _as_names(kind, key, value)
+        for key, value in table.items()  # false takes away, as in a log configuration, where there is nothing
+        if not (value is False and key in kind.model_fields and not isinstance(getattr(base, key, None), bool))
+    }
     form = {key: said.pop(key) for key in list(said) if key in CsvForm.model_fields}
     for key in said.keys() & NOT_OF_TABLES:
         raise LogError(f"{source}: [{role}] {key}: is for messages; a table has columns: take it out")
@@ -228,10 +233,11 @@ def _table(one: CsvRole, files: Mapping[str, Path], source: str) -> CsvTable:
     if wanted is None and len(files) != 1:
         raise LogError(f"{source}: [{one.role}] file: is missing; expected one of {', '.join(files) or 'no files'}")
     if wanted is not None and wanted not in files:
-        close = get_close_matches(wanted, files, 1)
-        hint = f"did you mean {close[0]!r}? " if close else ""
+        same = next((name for name in files if name.lower() == wanted.lower()), None)
+        beside = next((path for given in files.values() if (path := given.parent / wanted).is_file()), wanted)
+        hint = f"did you mean {same!r}?" if same else f"add {beside} to the command;"
         raise LogError(
-            f"{source}: [{one.role}] file: {wanted} is not among the tables; {hint}given: {', '.join(files)}"
+            f"{source}: [{one.role}] file: {wanted} is not among the tables; {hint} given: {', '.join(files)}"
         )
     path = next(iter(files.values())) if wanted is None else files[wanted]
     adapter, is_timed = one.adapter, one.role != "true_landmarks"

@@ -147,6 +147,8 @@ class CsvFile:
             return without_units.index(name)
         if name.isdecimal() and 1 <= int(name) <= len(names):
             return int(name) - 1
+        if name.isdecimal():
+            raise LogError(f"{self.path}: has no column {name} ({key}); it has {len(names)}, numbered from 1")
         close = get_close_matches(name, names, 1)
         hint = f"did you mean {close[0]!r}? " if close else ""
         more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""

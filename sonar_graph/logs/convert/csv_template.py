@@ -30,6 +30,7 @@ _RATE, _FORCE = r"gyr|omega|angular_?vel|(?:ang|turn|angular)_?rate|^rate|^w$", 
 _VELOCITY, _PLACE = r"vel|speed|^v$|dvl|bottom", r"pos|^$|^p$|^t$|translation|location"
 _TRUTH, _MAP, _FIX = r"truth|ground|^gt|_gt|reference|mocap", r"landmark|beacon|marker|target|map", r"gps|gnss|usbl|fix"
 _TIME = r"^(t|time|stamp|timestamp|unix|epoch|secs?|seconds|utc|datetime|date)$|time_?stamp|^time"
+_OF_IMU = "in the table of an IMU, without a unit: places, or angles (the third is then the yaw of [heading])?"
 _LAST_S = 1e10
 """Seconds since 1970 of the year 2286: a larger number counts milliseconds, or what is smaller still."""
 
@@ -41,6 +42,23 @@ class _Column:
     given: str
     name: str
     unit: str | None
+
+
+@dataclass(frozen=True)
+class _Guess:
+    """A role that a file may play, with the lines of its table."""
+
+    role: str
+    file: str
+    lines: list[str]
+    doubt: str = ""
+    """Question for the user, where the table is to be commented out."""
+
+    @property
+    def rank(self) -> tuple[bool, bool]:
+        """Order of guesses at one role, the best first: without doubt, and fixes by their latitude and longitude."""
+        is_geodetic = any(line.startswith("geodetic") for line in self.lines)
+        return bool(self.doubt), self.role == "positions" and not is_geodetic
 
 
 def csv_template(tables: list[Path]) -> str:
@@ -71,15 +89,19 @@ def csv_template(tables: list[Path]) -> str:
         '# down, or [roll, pitch, yaw] in degrees of ours_R_driver. Units: a factor, or a name such as "deg/s".\n'
         "# All keys: docs/tutorials/04_your_own_log.md"
     )
-    roles: dict[str, str] = {}
+    roles: dict[str, _Guess] = {}
     for name, file in files.items():
-        for role, lines in _guess(name, file):
-            roles.setdefault(role, "\n".join([f"[{role}]", f"file = {toml_value(name)}", *lines]))
+        for guess in _guess(name, file):
+            if guess.role not in roles or guess.rank < roles[guess.role].rank:
+                roles[guess.role] = guess
         parts.append(_listing(name, file))
     for role, empty in _EMPTY.items():
         likely = next((name for name in files if role in name.lower()), "...")
-        lines = [f"[{role}]", f"file = {toml_value(likely)}", *empty]
-        parts.append(roles.get(role) or "\n".join(f"# {line}" for line in lines))
+        guess = roles.get(role) or _Guess(role, likely, empty, "nothing found")
+        lines = [f"[{role}]", f"file = {toml_value(guess.file)}", *guess.lines]
+        if guess.doubt:
+            lines = [f"# {line}" for line in [f"[{role}]  # {guess.doubt}", *lines[1:]]]
+        parts.append("\n".join(lines))
     parts += [f"# not a table: {fault}" for fault in faults]
     return "\n\n".join(parts) + "\n"
 
@@ -105,47 +127,52 @@ def _listing(name: str, file: CsvFile) -> str:
     return "\n".join(lines)
 
 
-def _guess(name: str, file: CsvFile) -> Iterator[tuple[str, list[str]]]:
-    """Roles that a file may play, each with lines of its table."""
+def _guess(name: str, file: CsvFile) -> Iterator[_Guess]:
+    """Roles that a file may play."""
     columns, is_truth = [_column(column) for column in file.layout.names], bool(re.search(_TRUTH, name.lower()))
     stamp, where, forces = _stamp(columns, file), _where(columns, file), _triple(columns, _FORCE)
-    yield from _motion(columns, forces, stamp, is_truth=is_truth)
+    motion = _motion(columns, forces, is_truth=is_truth)
+    if motion:
+        yield _Guess(motion[0], name, [*stamp, *motion[1]])
     spread, bearing = _one(columns, r"range|distance|^r$"), _one(columns, r"azimuth|bearing")
     label = _one(columns, r"^id$|_id$|label|class|landmark|beacon")
     if spread and bearing:
-        yield "detections", [*stamp, *_detections(columns, spread, bearing, label)]
+        yield _Guess("detections", name, [*stamp, *_detections(columns, spread, bearing, label)])
         return
     turn = _named(columns, "q_?x", "q_?y", "q_?z", "q_?w")
     angles = _named(columns, "roll|phi", "pitch|theta", "yaw|psi|heading")
     if where and label and _place(columns):
-        yield "true_landmarks", [f"id = {toml_value(label.given)}", *where]
+        yield _Guess("true_landmarks", name, [f"id = {toml_value(label.given)}", *where])
     elif where and (is_truth or ((turn or angles) and not re.search(_FIX, name.lower()) and not forces)):
-        yield "truth", [*stamp, *where, *_orientation(turn, angles)]
+        yield _Guess("truth", name, [*stamp, *where, *_orientation(turn, angles)])
         return
     elif where:
-        yield "positions", [*stamp, *where]
+        place = _place(columns)
+        is_metric = where[0].startswith("geodetic") or (place is not None and place[0].unit in LENGTHS)
+        doubt = "" if is_metric or not motion or motion[0] != "imu" else _OF_IMU
+        yield _Guess("positions", name, [*stamp, *where], doubt)
     if depth := _one(columns, r"depth") or _one(columns, r"press"):
-        yield "depth", [*stamp, *_depth(depth)]
+        yield _Guess("depth", name, [*stamp, *_depth(depth)])
     if yaw := _one(columns, r"^(yaw|heading|compass|hdg|psi)"):
-        yield "heading", [*stamp, f"yaw = {toml_value(yaw.given)}", *_scale("scale", yaw, ANGLES), 'world = "ned"']
+        lines = [f"yaw = {toml_value(yaw.given)}", *_scale("scale", yaw, ANGLES), 'world = "ned"']
+        yield _Guess("heading", name, [*stamp, *lines])
 
 
-def _motion(
-    columns: list[_Column], forces: list[_Column] | None, stamp: list[str], *, is_truth: bool
-) -> Iterator[tuple[str, list[str]]]:
-    """The role of an IMU, else that of a Doppler log: velocities beside a truth are true ones."""
+def _motion(columns: list[_Column], forces: list[_Column] | None, *, is_truth: bool) -> tuple[str, list[str]] | None:
+    """Role and lines of an IMU, else of a Doppler log: velocities beside a truth are true ones."""
     rates = _triple(columns, _RATE) or _named(columns, "p", "q", "r")
     velocity = _triple(columns, _VELOCITY) or _named(columns, "u", "v", "w")
     if forces and (chosen := rates or velocity):
         doubt = "" if rates else "  # by their place; are these rates?"
         lines = [_list("angular_velocity", chosen) + doubt, *_scale("angular_velocity_scale", chosen[0], RATES)]
         lines += [_list("linear_acceleration", forces), *_scale("linear_acceleration_scale", forces[0], FORCES)]
-        yield "imu", [*stamp, *lines, '# rotation = "frd"  # where gravity is felt along -z']
-    elif velocity and not is_truth:
+        return "imu", [*lines, '# rotation = "frd"  # where gravity is felt along -z']
+    if velocity and not is_truth:
         lines = [_list("velocity", velocity), *_scale("scale", velocity[0], SPEEDS)]
         if status := _one(columns, r"valid|lock|status"):
             lines.append(f"# valid_where = {{{toml_value(status.given)} = 1}}")
-        yield "dvl", [*stamp, *lines, '# rotation = "frd"']
+        return "dvl", [*lines, '# rotation = "frd"']
+    return None
 
 
 def _detections(columns: list[_Column], spread: _Column, bearing: _Column, label: _Column | None) -> list[str]:

@@ -41,7 +41,11 @@ def kind_and_advice(path: Path, start: bytes) -> str:
             return f"{kind}; `sonar-graph convert {command} {path} -o {path.with_suffix('.mcap').name}` makes one"
     if path.suffix.lower() == ".oculus":
         return "a file of the Oculus viewer, which is not read; `sonar-graph convert oculus` reads network messages"
-    return _unknown_kind(start, "logs are .mcap files, and ROS bags become one by `sonar-graph convert rosbag`")
+    return _unknown_kind(
+        start,
+        "logs are .mcap files; ROS bags become one by `sonar-graph convert rosbag`, text tables by "
+        "`sonar-graph convert csv`",
+    )
 
 
 def why_no_bag(path: Path, start: bytes) -> str | None:

@@ -151,12 +151,17 @@ def _captions(comparison: Comparison) -> dict[str, str]:
             growth += (
                 f" T are the same fractions of this run as its {', '.join(others)} and {last} s of {DURATION_S:.1f} s."
             )
+    has_map = comparison.sequence.true_landmarks is not None or any(
+        run.landmarks is not None and len(run.landmarks) for run in comparison.runs
+    )
+    landmarks = (
+        f" Ellipses hold 95 % of where each estimator believes a landmark to be{as_large}; numbers are landmark IDs."
+    )
     gone, far = paths_cut_off(comparison), error_figures.errors_cut_off(comparison)
     return {
         "map": (
-            f"Paths and landmarks in the world of the start pose, {world}. Ellipses hold 95 % of where each estimator "
-            f"believes a landmark to be{as_large}; numbers are landmark IDs. Smoothed paths are drawn where they "
-            f"differ.{_leaving(gone)}"
+            f"Paths{' and landmarks' * has_map} in the world of the start pose, {world}.{landmarks * has_map} Smoothed "
+            f"paths are drawn where they differ.{_leaving(gone)}"
         ),
         "growth": growth,
         "errors": DRAWINGS["errors"].caption.format(unaligned=world, cut=_leaving(far)),

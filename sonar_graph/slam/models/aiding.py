@@ -1,4 +1,4 @@
-"""Yaw of a body as a compass measures it, and the robust kernel of headings and position fixes.
+"""Yaw of a body as a compass measures it, the robust kernel of headings and position fixes, and whom it silences.
 
 For the turn ``R Exp(theta)`` of a body, with the rows (x, a, c) and (y, b, d) of R::
 
@@ -8,6 +8,7 @@ Kernel of Huber: an error of d > k standard deviations has the noise ``R d / k``
 """
 
 import math
+from collections import Counter
 
 import numpy as np
 
@@ -29,3 +30,41 @@ def doubted(e: Floats, S: Floats, R: Floats) -> Floats:
     """Covariance of an innovation e with the kernel's noise, where it is S with Gaussian noise R, shapes (m, m)."""
     distance = math.sqrt(e @ np.linalg.solve(S, e))
     return np.asarray(S + (max(1.0, distance / HUBER_WIDTHS[len(e)]) - 1.0) * R)
+
+
+CONTRADICTING_SIGMAS = 5.0
+CONTRADICTING_SHARE = 0.2
+"""Of headings or fixes: less are outliers, which the kernel is for."""
+FEWEST_JUDGED = 10
+CAUSES = {
+    "heading": "headings contradict its yaw by more than {:g} sigma: gyro noise, gyro bias or start larger than the "
+    "calibration says, or headings worse than heading.sigma_rad?",
+    "positions": "position fixes contradict its position by more than {:g} sigma: noise of gyros or Doppler log, or "
+    "the start, larger than the calibration says, or fixes worse than positions.sigma_m?",
+}
+"""What is said of a sensor that an estimator contradicts, after the number of rows."""
+
+
+class Contradictions:
+    """Counts the headings and fixes of a run that its estimate contradicts, which the kernel would keep silent about.
+
+    A filter that is too sure takes right headings for outliers, then their error for one of the compass, and goes on
+    being wrong. So headings are compared with the yaw alone, beside which the calibration's ``heading.bias_sigma_rad``
+    is noise.
+    """
+
+    def __init__(self) -> None:
+        self._far, self._judged = Counter[str](), Counter[str]()
+
+    def judge(self, sensor: str, distances: Floats | float) -> None:
+        """Take note of distances in sigmas, of one row or several."""
+        self._far[sensor] += int(np.count_nonzero(np.asarray(distances) > CONTRADICTING_SIGMAS))
+        self._judged[sensor] += np.size(distances)
+
+    def messages(self) -> list[str]:
+        """A line for each sensor of which more than `CONTRADICTING_SHARE` of the rows contradict the estimate."""
+        return [
+            f"{self._far[sensor]} of {judged} {CAUSES[sensor].format(CONTRADICTING_SIGMAS)}"
+            for sensor, judged in self._judged.items()
+            if judged >= FEWEST_JUDGED and self._far[sensor] > CONTRADICTING_SHARE * judged
+        ]

@@ -61,8 +61,9 @@ class SmootherParams(Section):
     stale_shift_m: float = Field(0.1, gt=0)
     """Distance that a landmark may move before a bounded window starts again from a solution of its graph."""
     waiting_gain: float = Field(5.0, ge=0)
-    """New sightings enter the estimate at the next keyframe, or as soon as their expected gain, the sum of predicted
-    variance over noise variance, exceeds this. 0: always at once."""
+    """New sightings and position fixes enter the estimate at the next keyframe, or as soon as their expected gain, the
+    sum of predicted variance over noise variance, which counts fifty times of a fix, exceeds this. 0: always at
+    once."""
 
 
 class WholeHistory(Section):

@@ -1,6 +1,7 @@
 """Text tables give the same sequence as arrays, whatever their units, axes, delimiters and times."""
 
 import re
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 
@@ -201,6 +202,30 @@ def test_a_template_of_tables_with_names_and_units_reads_them_unedited(tmp_path)
         assert role.stamps_ns[0] == 1_900_000_000 * 10**9
     assert "# not a table:" in text
     assert "notes.md: has no line with numbers" in text
+
+
+OF_IMU = "time,positionX,positionY,positionZ,gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z"
+
+
+@pytest.mark.parametrize(
+    ("tables", "live"),
+    [
+        ({"a_imu.log": OF_IMU, "b_dgps.log": "time,latitude,longitude"}, "b_dgps.log"),
+        ({"a_places.log": "time,x,y,z", "b_dgps.log": "time,latitude,longitude"}, "b_dgps.log"),
+        ({"a_imu.log": OF_IMU}, None),
+        ({"a_imu.log": OF_IMU, "b_places.log": "time,x,y,z"}, "b_places.log"),
+        ({"a_imu.log": OF_IMU.replace("X,", "X [m],")}, "a_imu.log"),
+    ],
+)
+def test_a_template_prefers_latitudes_and_asks_about_places_that_an_imu_measures(tmp_path, tables, live):
+    for name, header in tables.items():
+        (tmp_path / name).write_text(f"{header}\n" + ",".join("1" for _ in header.split(",")) + "\n")
+    text = csv_template([tmp_path])
+    fixes = tomllib.loads(text).get("positions")
+    assert (fixes and fixes["file"]) == live
+    if live is None:
+        assert "# [positions]  # in the table of an IMU" in text
+        assert '# position = ["positionX", "positionY", "positionZ"]' in text
 
 
 def test_columns_without_names_are_numbered_and_rows_that_say_invalid_are_left_out(tmp_path):
