@@ -12,7 +12,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from sonar_graph.errors import EvaluationError
 from sonar_graph.measurements import NS_PER_S, Floats, Ints
@@ -331,6 +330,10 @@ def named_by_place(estimated: LandmarkMap, true: LandmarkMap, farthest_m: float)
     squared distances (Kuhn, Naval Research Logistics 2, 1955). Landmarks without a partner keep their identity.
     """
     unknown = np.flatnonzero((estimated.ids >= FIRST_ANONYMOUS_ID) & ~np.isin(estimated.ids, true.ids))
+    if not len(unknown):
+        return estimated
+    from scipy.optimize import linear_sum_assignment  # takes most of a second to load
+
     free = np.flatnonzero(~np.isin(true.ids, estimated.ids))
     apart = estimated.positions[unknown, None, :2] - true.positions[None, free, :2]
     squared = np.sum(apart**2, axis=-1)

@@ -24,7 +24,6 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
@@ -114,6 +113,8 @@ def holes_before(stamps_ns: Ints) -> Ints:
 def strapdown_integrals(seconds: Floats, rate: Floats, force: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     """C, F, S and P of the module's equations at every sample."""
     turns = 0.5 * (rate[:-1] + rate[1:]) * np.diff(seconds)[:, None]
+    from scipy.integrate import cumulative_trapezoid  # takes most of a second to load
+
     integral = partial(cumulative_trapezoid, x=seconds, axis=0, initial=0.0)
     C = running_rotations(turns)
     felt = C @ force[:, :, None]

@@ -26,7 +26,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import solve_triangular
-from scipy.optimize import minimize
 
 from sonar_graph.measurements import Floats
 
@@ -85,6 +84,8 @@ def fit(stretches: Sequence[SampleSeries], prior_sigmas: Floats, ratios: Floats 
             return NormalEquations.of(stretches, bounded(logs)).criterion(prior_sigmas)
 
         start = np.array([[-2.0, -6.0], [1.0, -6.0], [-2.0, -2.0]])
+        from scipy.optimize import minimize  # takes most of a second to load
+
         best = minimize(
             criterion, start[0], method="Nelder-Mead", options={"initial_simplex": start, "xatol": 0.1, "fatol": 0.02}
         )

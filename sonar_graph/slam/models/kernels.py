@@ -8,7 +8,6 @@ from typing import Annotated, Literal
 import gtsam
 import numpy as np
 from pydantic import Field
-from scipy.integrate import quad
 
 from sonar_graph.calibration import Section
 from sonar_graph.measurements import Floats
@@ -37,6 +36,8 @@ class Kernel(Section):
     @property
     def log_normaliser(self) -> float:
         """Logarithm of n, of a density ``n / sigma exp(-rho(e / sigma))``. A Cauchy kernel needs a width above 1."""
+        from scipy.integrate import quad  # takes most of a second to load
+
         area, _ = quad(lambda e: math.exp(-float(self.loss(np.array(e)))), -math.inf, math.inf)
         return -math.log(area)
 
