@@ -32,6 +32,11 @@ class Inbox:
                 self.dropped[oldest.topic] += 1
             self._changed.notify()
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether no message waits."""
+        return not self._messages
+
     def take(self, timeout_s: float) -> list[Message]:
         """All messages that wait; an empty list if none comes in time."""
         with self._changed:
@@ -81,7 +86,7 @@ class Silence:
         known = {topic: at_s - heard_s for topic, heard_s in self._heard_s.items() if topic in topics}
         silent = {topic: for_s for topic, for_s in known.items() if for_s > SILENT_S}
         new = silent.keys() - self._said
-        if new and len(silent) == len(known):
+        if new and all(at_s - heard_s > SILENT_S for heard_s in self._heard_s.values()):
             yield f"nothing comes any more since {min(silent.values()):.0f} s: does the sender run?"
         else:
             yield from (f"{topic}: nothing since {silent[topic]:.0f} s" for topic in sorted(new))

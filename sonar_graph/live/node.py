@@ -208,8 +208,9 @@ class LiveRun:
             self._state()
             self._stated_s = now_s
             motion = {topic for role, topic in self.engine.in_use.items() if role in MOTION}
-            for line in self._silence.lines(motion, now_s):
-                self._said(line)
+            if self.inbox.is_empty:  # messages that wait were not silent
+                for line in self._silence.lines(motion, now_s):
+                    self._said(line)
         if self._worker.error is not None and not self._is_failed:
             self._is_failed = True
             self._said(f"{self._failure()}; everything is still recorded")

@@ -116,7 +116,7 @@ class Figures(NamedTuple):
             figures = [bright / float(np.nanmax(design.mask)) for bright, _ in parts]
             figure, dark = figures[0], parts[0][1] / min(float(np.nanmin(design.mask)), -1.0)
             has_dark = bool((dark > PART).any())
-            own_shadow = behind(np.minimum(figure + dark, 1.0), OWN_SHADOW_CELLS) > PART
+            own_shadow = behind(figure + dark, OWN_SHADOW_CELLS) > PART
             compared = area & ~(own_shadow & ((away_m > material_m) | (not has_dark)))
             is_out = (figure < OUT) & compared
             is_near = cv2.dilate((figure > PART).astype(np.uint8), kernel) > 0
@@ -241,8 +241,8 @@ def fill_evidence(
             kept = np.empty(kept.shape)
             kept_sums(values, is_seen, strips, kept)
         covered = least_covered(level[0], values, strips, kept, count, gram, only_dark, dz, delta < 0)
-        covered = min(covered, design)
-        found[k, 9], found[k, 10] = math.log(covered / total), math.log(design / covered)
+        covered = min(covered, design if beta > 0 else only_dark)
+        found[k, 9], found[k, 10] = math.log(covered / total), math.log(max(design / covered, 1.0))
         least = min(least, found[k, 9])
     for k in range(len(template)):
         found[k, 9] = least - found[k, 9]
@@ -327,7 +327,7 @@ def least_squares(gram: Floats, products: Floats32, total: float, at: Ints, c: F
 
 def behind(figure: Floats32, cells: int) -> Floats32:
     """Share of each cell that lies within so many cells behind a figure, and not in it, shape as given."""
-    shaded = np.zeros_like(figure)
+    inside, shaded = np.minimum(figure, 1.0), np.zeros_like(figure)  # the near side of foam is brighter than 1
     for step in range(1, cells + 1):
-        shaded[step:] = np.maximum(shaded[step:], figure[:-step])
-    return np.clip(shaded - figure, 0.0, 1.0)
+        shaded[step:] = np.maximum(shaded[step:], inside[:-step])
+    return np.clip(shaded - inside, 0.0, 1.0)

@@ -24,7 +24,7 @@ from sonar_graph.numerics import compiled
 from sonar_graph.sonar.templates import FINE, Blur, Floats32, echo_power, seen_db, seen_share, with_side
 
 SIDE_M = 0.006
-"""Width of the side for which it is drawn."""
+"""Width of the side for which it is drawn, to a fine point."""
 SHADES, SHADE_FINE = 12, FINE // 2
 """Shadows that are drawn: number, and by how many points of the fine grid each is longer than the one before."""
 STEPS = 2
@@ -49,14 +49,15 @@ class Relief(NamedTuple):
         """A design at this heading against the direction away from the sonar, which is the grid's x axis."""
         of_bright, power = echo_power(design, heading_rad, side, cell_m)
         is_bright = power > 1
-        shaded, raised_power = is_bright.copy(), with_side(power, round(SIDE_M / cell_m * FINE))
+        width = round(SIDE_M / cell_m * FINE)
+        shaded, raised_power = is_bright.copy(), with_side(power, width)
         bright, whole, raised = (seen_db(one, cell_m, blur_m) for one in (of_bright, power, raised_power))
         shades = [np.zeros_like(bright)]
         for _ in range(SHADES):
             for _ in range(SHADE_FINE):
                 shaded[1:] |= shaded[:-1]
             shades.append(seen_share(shaded & ~is_bright, cell_m, blur_m))
-        return cls(bright, (raised - whole) / SIDE_M, whole - bright, np.stack(shades))
+        return cls(bright, (raised - whole) / (width * cell_m / FINE), whole - bright, np.stack(shades))
 
     def place(
         self, level_db: Floats32, seen: Floats32, cells: tuple[Ints, Ints], start: Floats, side_m: float,

@@ -129,6 +129,16 @@ def test_a_doppler_log_that_stops_and_returns_is_named_both_times(tmp_path, endp
     assert_equals_log(outcome, tmp_path, 150)
 
 
+def test_images_that_go_on_are_not_nothing():
+    silence = inbox.Silence()
+    for at_s in np.arange(0.0, 17.0, 1.0):
+        for topic in ("/imu/data", "/dvl/data")[: 2 if at_s < 10 else 0]:
+            silence.heard(topic, at_s)
+        silence.heard("/sonar/image", at_s)
+    said = list(silence.lines({"/imu/data", "/dvl/data"}, 17.0))
+    assert said == ["/dvl/data: nothing since 8 s", "/imu/data: nothing since 8 s"]
+
+
 def test_a_sender_that_ends_is_missed(tmp_path, endpoint, messages, monkeypatch):
     monkeypatch.setattr(inbox, "SILENT_S", 0.5)
     outcome, _, said = lived(tmp_path, endpoint, Robot(endpoint, [m for m in messages if at_s(messages, m) < 10]))

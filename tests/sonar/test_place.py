@@ -15,6 +15,7 @@ from sonar_graph.sonar.appearance import AppearanceParams, CandidateFit
 from sonar_graph.sonar.confusion import confusion_for
 from sonar_graph.sonar.geometry import FloorView
 from sonar_graph.sonar.place import Relief
+from sonar_graph.sonar.templates import drawn
 
 from .polar_images import candidates_at
 
@@ -49,6 +50,17 @@ def test_a_figure_with_side_and_shadow_is_placed_where_it_is(off):
     place, bound = place_in(patch_with((40, 0.7, 0.5, -9.0), (5, 6), 0.01, 1), (5 + off[0], 6 + off[1]))
     np.testing.assert_allclose(place, (5, 6), atol=2e-3)
     assert (bound < 1e-3).all()
+
+
+def test_a_metre_of_side_adds_what_the_templates_add_for_it():
+    """A relief of which the templates draw a side of two fine points, 7.5 mm, over the same figure without it."""
+    design = DEFAULT_DESIGNS[2]
+    flush, raised = (
+        drawn(replace(design, relief_m=relief_m), 0.3, SIDE, CELL_M, BLUR_M)[0] for relief_m in (0.0, 0.012)
+    )
+    np.testing.assert_allclose(RELIEF.figure, flush, atol=1e-4)
+    is_bright = flush > 0.5 * flush.max()
+    np.testing.assert_allclose((0.0075 * RELIEF.side)[is_bright], (raised - flush)[is_bright], atol=0.8)
 
 
 def test_place_and_bound_are_those_of_least_squares_over_the_cells_in_view():
