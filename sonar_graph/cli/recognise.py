@@ -258,7 +258,7 @@ def calibrate(
             )
         else:
             measured = measure(
-                [(log, reading.read(log, images=True)) for log in logs],
+                [(log, reading.read(log)) for log in logs],
                 topic=topic,
                 config=reading.config,
                 designs=known,
@@ -297,7 +297,7 @@ def with_motion(log: Path, reading: ReadingOptions, motion: MotionFrom | None) -
             "out, or bring the sensors of another file in with `sonar-graph join`"
         )
     if motion == "navigation" or (motion is None and not lacking):
-        return reading.read(log, images=True), "navigation"
+        return reading.read(log), "navigation"
     alone = read_images_alone(
         log,
         calibration=reading.given,

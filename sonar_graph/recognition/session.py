@@ -119,12 +119,11 @@ def recognise(
     >>> run = recognise((block.frames for block in blocks), simulate_basin(options))
     >>> ids, probability = run.detections.most_probable()
     """
-    others = {role: topic for role, topic in (topics or {}).items() if role != "sonar"}
     if sequence is None:
         if not isinstance(images, Path | str):
             raise MeasurementError("recognise: frames need a sequence with IMU and DVL; give one, or the path of a log")
         sequence = read_log(
-            Path(images), calibration=calibration, topics=others, config=config, window=window, salvage=salvage
+            Path(images), calibration=calibration, topics=topics, config=config, window=window, salvage=salvage
         )
     found = recognise_images(
         images,

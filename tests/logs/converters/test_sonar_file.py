@@ -15,7 +15,7 @@ from sonar_graph.cli.main import app
 from sonar_graph.errors import DatasetError, LogError
 from sonar_graph.logs.convert.didson_aris import convert_didson
 from sonar_graph.logs.convert.sonar_file import ByteSource, Lost
-from sonar_graph.logs.reading import read_sonar_frames
+from sonar_graph.logs.sonar_images import read_sonar_frames
 
 from .sonar_recordings import START_NS, STEP_NS, Aris, Converted, Ddf, Oculus, converted, images, put
 
