@@ -100,7 +100,9 @@ class LogSummary:
     warnings: tuple[str, ...] = ()
     """Sentences about what can be read but looks wrong, each after its role."""
     sonar: str | None = None
-    """Size, sector and range of the sonar's first frames."""
+    """Size, sector and range of the sonar's first frames, or why they cannot be read."""
+    sonar_fault: bool = False
+    """True where they cannot be read."""
     toml: str = ""
     """The log configuration to start from; read back unchanged it makes the same choices."""
 
@@ -113,6 +115,17 @@ class LogSummary:
             if role.candidates
             else f"no {role.role.upper()}"
             for role in needed
+        )
+
+    @property
+    def has_images_alone(self) -> bool:
+        """True for a log with sonar images and nothing that may be an IMU or Doppler log."""
+        of = {role.role: role for role in self.roles}
+        needed = [role for role in self.roles if ROLES[role.role].is_required]
+        return (
+            of[SONAR].topic is not None
+            and not self.sonar_fault
+            and not any(role.topic or role.candidates for role in needed)
         )
 
     @property
@@ -198,13 +211,13 @@ def inspect_log(
         pass  # `calibration` says so
     except SonarGraphError as error:
         unusable.append(str(error))
-    sonar = None
+    sonar, sonar_fault = None, False
     if (sonar_topic := choices[SONAR].topic) is not None:
         try:
             frames = next(read_sonar_frames(recording.path, sonar_topic, config), None)
             sonar = describe_frames(frames) if frames else None
         except SonarGraphError as error:
-            sonar = f"cannot be read: {error}"
+            sonar, sonar_fault = f"cannot be read: {error}", True
     return LogSummary(
         path=recording.path,
         name=recorded_name(recording),
@@ -217,6 +230,7 @@ def inspect_log(
         left_out=tuple(left_out),
         warnings=tuple(warnings),
         sonar=sonar,
+        sonar_fault=sonar_fault,
         toml=starting_config(recording, list(choices.values()), config),
     )
 
