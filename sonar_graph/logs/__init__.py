@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from sonar_graph.logs.result_log import write_result
     from sonar_graph.logs.roles import DETECTIONS, ROLES, Choice, choose_each, choose_topics, wanted_types
     from sonar_graph.logs.sonar_images import ImagesAlone, joined_calibration, lacking_navigation, no_images
-    from sonar_graph.logs.sonar_images import read_images_alone, read_sonar_frames
+    from sonar_graph.logs.sonar_images import read_images_alone, read_sonar_frames, sonar_frame
     from sonar_graph.logs.trajectory_files import write_landmarks_csv, write_tum
     from sonar_graph.logs.vehicle_setup import METADATA, PartialCalibration, with_notes
     from sonar_graph.logs.viewer_messages import PICTURES, Picture, landmark_markers
@@ -25,6 +25,6 @@ __all__ = [
     "LiveRecord", "LogSummary", "METADATA", "PICTURES", "PartialCalibration", "Picture", "ROLES", "TopicSummary",
     "choose_each", "choose_topics", "detection_messages", "dropped_in", "inspect_log", "joined_calibration",
     "lacking_navigation", "landmark_map_message", "landmark_markers", "no_images", "pinned",
-    "read_images_alone", "read_log", "read_sonar_frames", "rows_of", "sonar_image_messages", "wanted_types",
-    "with_notes", "write_amended", "write_landmarks_csv", "write_log", "write_result", "write_tum",
+    "read_images_alone", "read_log", "read_sonar_frames", "rows_of", "sonar_frame", "sonar_image_messages",
+    "wanted_types", "with_notes", "write_amended", "write_landmarks_csv", "write_log", "write_result", "write_tum",
 ]

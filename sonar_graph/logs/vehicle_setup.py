@@ -237,8 +237,8 @@ WIDER = 3.0
 
 
 NO_START = (
-    "not stated, and neither heading nor fixes say it: the world begins at the vehicle with x forward; state it as "
-    "[start] position_m and rpy_rad in a file for --calibration where it matters"
+    "start pose not stated, and neither heading nor fixes say it: the world begins at the vehicle with x forward; "
+    "state it as [start] position_m and rpy_rad in a file for --calibration where it matters"
 )
 
 
@@ -251,7 +251,7 @@ def with_measured_start(calibration: Calibration, blocks: Mapping[str, Any]) -> 
     said = ", ".join(plain_lines(start.model_dump()))
     return (
         calibration.model_copy(update={"start": start}),
-        f"not stated, so by the first headings and fixes: {said}",
+        f"start pose not stated, so by the first headings and fixes: {said}",
     )
 
 
