@@ -13,8 +13,7 @@ A click errs by a centimetre, more than the recogniser does. With the distance d
 median one of the track's sightings, and V the variance of such means by the scatter of the labels of a track (that of
 `CLICK_SIGMA_M` where no track has two), the true place is taken as the sightings' plus
 ``max(0, 1 - mean V / mean d^2) d`` (James and Stein 1961): labels tell an error that all tracks share only as far as it
-exceeds their own. The errors of the motion that carries a place are in the accuracy of the model, which so is rather too
-poor than too good.
+exceeds their own. Errors of the motion that carries a place add to the model's sigmas, which so are rather too large.
 """
 
 import csv
