@@ -10,6 +10,15 @@ from sonar_graph.calibration import SonarImage
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Floats, Ints
 
+IN_PLANE = "landmarks are compared in the plane of the image, where they look less like their designs"
+NO_HEIGHT = f"the height of the floor is not known: {IN_PLANE}; state [floor] z_m and sigma_m in a --calibration file"
+NO_DEPTH = f"no depth comes: the height over the floor is not known, and {IN_PLANE}"
+NO_TILT = (
+    f"height and tilt are not known: {IN_PLANE}; state [floor] z_m, sigma_m and [start] position_m, rpy_rad in a "
+    "--calibration file"
+)
+"""What is lacking where a sonar is not known to look at a floor."""
+
 
 @dataclass(frozen=True, eq=False)
 class SonarFrames:

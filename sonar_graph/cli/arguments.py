@@ -147,14 +147,14 @@ class ReadingOptions:
 
         return TimeWindow.parse(self.start, self.end)
 
-    def read(self, log: Path, *, images: bool = False, progress: Callable[[int, int], None] | None = None) -> Sequence:
-        """Read a log as a sequence; with images the topic of the role ``sonar`` is for these, which are read apart."""
+    def read(self, log: Path, *, progress: Callable[[int, int], None] | None = None) -> Sequence:
+        """Read a log as a sequence."""
         from sonar_graph.logs import read_log
 
         return read_log(
             log,
             calibration=self.given,
-            topics={role: topic for role, topic in self.choices.items() if not (images and role == "sonar")},
+            topics=self.choices,
             config=self.config,
             window=self.window,
             salvage=self.salvage,

@@ -47,7 +47,7 @@ def inspect(
     """Say what is in a log: topics, rates, gaps, which topic would be used for what and why, what sensors disagree.
 
     Ends with 0 where nothing is in doubt, 3 where the log can be used but something is in doubt (warnings, lines to
-    act on), and 1 where it cannot be used as it is: no IMU or Doppler log, contradictions, damage.
+    act on, only sonar images), and 1 where it cannot be used as it is: no IMU or Doppler log, contradictions, damage.
     """
     from sonar_graph.files import strict_json
     from sonar_graph.logs import inspect_log
@@ -60,7 +60,7 @@ def inspect(
     findings: list[Finding] = []
     grave: set[str] = set()
     skipped = large = ""
-    is_usable = not (summary.obstacles or summary.unusable or summary.damage)
+    is_usable = not ((summary.obstacles and not summary.has_images_alone) or summary.unusable or summary.damage)
     if quick:
         skipped = "not compared: --quick"
     elif summary.obstacles:
@@ -91,7 +91,7 @@ def inspect(
         print_summary(summary, findings, grave, skipped, large)
     if not is_usable:
         raise typer.Exit(UNUSABLE)
-    if summary.warnings or any(finding.acts for finding in findings):
+    if summary.has_images_alone or summary.warnings or any(finding.acts for finding in findings):
         raise typer.Exit(DOUBTFUL)
 
 
@@ -153,8 +153,17 @@ def print_summary(summary: LogSummary, findings: list[Finding], grave: set[str],
     if summary.obstacles:
         lacking = escape(", ".join(summary.obstacles))
         console.print(f"[bold red]not usable for compare[/]: {lacking}", soft_wrap=True)
+        if summary.has_images_alone:
+            console.print(
+                escape(
+                    f"Its sonar images can be used: sonar-graph recognise {summary.path} -o recognised.mcap; "
+                    f"sonar-graph join {summary.path} NAV -o joined.mcap brings in IMU and Doppler log of another file"
+                ),
+                soft_wrap=True,
+            )
         hint = escape(f"sonar-graph inspect {summary.path} --toml > log.toml")
-        console.print(f"Say what its topics are: {hint}, edit it, and give --log-config log.toml", soft_wrap=True)
+        say_it = "If it has IMU and Doppler log, say" if summary.has_images_alone else "Say"
+        console.print(f"{say_it} what its topics are: {hint}, edit it, and give --log-config log.toml", soft_wrap=True)
 
 
 @with_options("salvage")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -28,8 +27,6 @@ TOPIC = "/sonar/image"
 SEARCH_S = 10.0
 DISAGREEING = 4.0
 """Standard deviations of the estimated offset beyond which a stated one is doubted."""
-OF_THE_IMAGES = ("image", "lens", "elevation_aperture_rad")
-"""Fields of a sonar's calibration that a recording of images knows better than a log without."""
 NS_PER_S = 10**9
 
 
@@ -80,11 +77,18 @@ def join(
 
     The options about topics and calibration are of NAV, but for the role sonar, which is of IMAGES.
     """
-    from sonar_graph.logs import METADATA, read_images_alone, read_sonar_frames, with_notes, write_amended
+    from sonar_graph.logs import (
+        METADATA,
+        joined_calibration,
+        read_images_alone,
+        read_sonar_frames,
+        with_notes,
+        write_amended,
+    )
 
     path = writable_log(output, images, navigation, overwrite=overwrite)
     refuse_images(navigation)
-    sequence, topic = reading.read(navigation, images=True), reading.choices.get("sonar")
+    sequence, topic = reading.read(navigation), reading.choices.get("sonar")
     with as_log(images) as log:
         alone = read_images_alone(log, topic=topic, salvage=reading.salvage)
         seen = look(log, topic, alone.calibration, salvage=reading.salvage)
@@ -92,9 +96,9 @@ def join(
         require_overlap(images, navigation, sequence, seen, around_s, 0.0 if is_stated else search or SEARCH_S)
         seconds, said = offset_of(seen, sequence, around_s, search or SEARCH_S, is_stated=is_stated)
         shift_ns = round(seconds * NS_PER_S)
-        notes = {f"images.{key}": note for key, note in alone.notes.items()}
+        notes = {f"images.{key}": note for key, note in alone.notes.items() if key != "log.skipped"}
         record = with_notes(navigation, notes | {"images.file": images.name, "images.clock_offset": said})
-        record |= {"calibration": with_sonar_of(alone.calibration, record.get("calibration", "{}"))}
+        record |= {"calibration": joined_calibration(log, navigation, topic, reading.given)}
         with progress_bars() as progress:
             blocks = read_sonar_frames(log, topic, salvage=reading.salvage, refused=lambda *_: None)
             amended = write_amended(
@@ -205,14 +209,6 @@ def offset_of(
     is_doubted = abs(estimate.seconds - around_s) > DISAGREEING * estimate.sigma_s
     warning = "; Warning: they do not agree, leave --offset out to take the images' own" if is_doubted else ""
     return around_s, f"{around_s:+.3f} s, as stated; by the images {estimate}{warning}"
-
-
-def with_sonar_of(images: Calibration, recorded: str) -> str:
-    """Recorded calibration of the navigation, with what the recording of images knows of its sonar."""
-    known: dict[str, Any] = json.loads(recorded)
-    own = images.sonar.model_dump(mode="json", exclude_unset=True)
-    better = {name: own[name] for name in OF_THE_IMAGES if name in own}
-    return json.dumps(known | {"sonar": own | known.get("sonar", {}) | better})
 
 
 def on_the_clock(blocks: Iterator[SonarFrames], shift_ns: int, progress: Callable[[int], None]) -> Iterator[Outgoing]:

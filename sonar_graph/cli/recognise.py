@@ -148,7 +148,15 @@ def recognise(
     Detections that an earlier recognise put into the log are replaced. Without IMU or Doppler log the motion is from
     the images.
     """
-    from sonar_graph.logs import DETECTIONS, METADATA, detection_messages, no_images, with_notes, write_amended
+    from sonar_graph.logs import (
+        DETECTIONS,
+        METADATA,
+        detection_messages,
+        lacking_navigation,
+        no_images,
+        with_notes,
+        write_amended,
+    )
     from sonar_graph.recognition import SEE_TRACKS, TrackStories
     from sonar_graph.report.tracks import write_track_page
     from sonar_graph.sonar import Recogniser
@@ -183,9 +191,10 @@ def recognise(
         out.print(f"  {count:6d}  {outcome}")
     for line in found.naming(getattr(sequence, "true_landmarks", None)):
         if page is None or line != SEE_TRACKS:
-            out.print(line)
+            out.print(line, markup=False)
     if motion != "navigation":
-        for line in without_navigation(found):
+        has_navigation = not lacking_navigation(log, reading.choices, reading.config, reading.window)
+        for line in without_navigation(found, f"as --motion {motion} asks" if has_navigation else ""):
             echo(f"Without navigation: {line}")
     for stamp_ns, reason in found.warnings[:MOST_WARNINGS_SHOWN]:
         out.print(f"Warning: {(stamp_ns - sequence.start_ns) * 1e-9:.3f} s: {reason}")
@@ -258,7 +267,7 @@ def calibrate(
             )
         else:
             measured = measure(
-                [(log, reading.read(log, images=True)) for log in logs],
+                [(log, reading.read(log)) for log in logs],
                 topic=topic,
                 config=reading.config,
                 designs=known,
@@ -297,7 +306,7 @@ def with_motion(log: Path, reading: ReadingOptions, motion: MotionFrom | None) -
             "out, or bring the sensors of another file in with `sonar-graph join`"
         )
     if motion == "navigation" or (motion is None and not lacking):
-        return reading.read(log, images=True), "navigation"
+        return reading.read(log), "navigation"
     alone = read_images_alone(
         log,
         calibration=reading.given,
@@ -309,22 +318,22 @@ def with_motion(log: Path, reading: ReadingOptions, motion: MotionFrom | None) -
     return alone, motion or "images"
 
 
-def without_navigation(found: Recognition) -> list[str]:
-    """Lines on where the motion is from, and what is lost."""
+def without_navigation(found: Recognition, asked: str = "") -> list[str]:
+    """Lines on where the motion is from, and what is lost; ``asked`` says who left the log's navigation out."""
     from sonar_graph.recognition import NO_FLOOR
 
     motion, lines = found.notes["detections.motion"], []
     lines.append(f"motion {motion}")
     if motion.startswith("none"):
         lines.append("frames of a sonar at rest repeat their speckle, so that each track counts once")
-    if NO_FLOOR in found.outcomes:
-        lines.append(
-            "height and tilt are not known, so that designs are compared in the plane of the image; a file for "
-            "--calibration states them: [floor] z_m, sigma_m and [start] position_m, rpy_rad"
-        )
-    else:
+    if NO_FLOOR not in found.outcomes:
         lines.append("height and tilt are taken to stay those of the calibration's start")
-    lines.append("no estimator can run on the images alone; `sonar-graph join` brings in IMU and Doppler log of a file")
+    if asked:
+        lines.append(f"the log's IMU and Doppler log are not used, {asked}")
+    else:
+        lines.append(
+            "no estimator can run on the images alone; `sonar-graph join` brings in IMU and Doppler log of a file"
+        )
     return lines
 
 

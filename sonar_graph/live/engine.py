@@ -33,6 +33,7 @@ from sonar_graph.logs import (
     choose_topics,
     pinned,
     rows_of,
+    sonar_frame,
 )
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.logs.mcap import Keep, Recording, Topic
@@ -147,6 +148,8 @@ class Engine:
         """Lines for the user, who takes them away."""
         self.waits_for = ""
         """What the first messages lack."""
+        self._sonar: str | None = None
+        """Frame of the sonar, once an image has come."""
         self._first: Held = []
         self._first_motion_ns: int | None = None
         self._set_up_ns = 0
@@ -296,15 +299,16 @@ class Engine:
             held[:] = [one for one in held if one not in unreadable]
             recording = self._recording(held)
         try:
-            assembly = Assembly(recording, choices, self._given)
+            self._sonar = sonar_frame(recording, wanted.get("sonar"), self._config) or self._sonar
+            assembly = Assembly(recording, choices, self._given, self._sonar)
             choices = {
                 role: choice if _is_of_use(assembly, role) else replace(choice, topic=None, adapter=None)
                 for role, choice in choices.items()
             }
-            assembly = Assembly(recording, choices, self._given)
+            assembly = Assembly(recording, choices, self._given, self._sonar)
             tables = pinned(self._config, choices, assembly)
             config = LogConfig.parse(json.loads(json.dumps(tables)), self._config.source)
-            assembly = Assembly(recording, choose_topics(recording, {}, config), self._given)
+            assembly = Assembly(recording, choose_topics(recording, {}, config), self._given, self._sonar)
             sequence = assembly.sequence("live")
             reader = MessageReader(assembly)
         except SonarGraphError as error:

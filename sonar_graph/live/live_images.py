@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from sonar_graph.images import NO_DEPTH, NO_HEIGHT
 from sonar_graph.live.arrivals import joined
 from sonar_graph.live.engine import Engine, LiveOptions
 from sonar_graph.live.live_messages import Message
@@ -27,9 +28,6 @@ ROLES = ("imu", "dvl", "depth")
 UNREADABLE = "no sonar image"
 ENDED, FAILED = "not recognised: the run ended", "not recognised: recognition failed"
 TOO_EARLY = "not recognised: of the first seconds, which give the calibration and the templates"
-IN_PLANE = "landmarks are compared in the plane of the image, where they look less like their designs"
-NO_HEIGHT = f"the height of the floor is not known: {IN_PLANE}; state [floor] z_m and sigma_m in a --calibration file"
-NO_DEPTH = f"no depth comes: the height over the floor is not known, and {IN_PLANE}"
 
 
 class LiveImages:

@@ -16,13 +16,13 @@ from sonar_graph.logs.adapters import LogConfig, leaf_fields, plain_lines, shipp
 from sonar_graph.logs.cdr import Struct, decode, definition, parse_definition, short_name
 from sonar_graph.logs.checks import stamp_faults
 from sonar_graph.logs.mcap import STAMP_BYTES, Keep, Recording, TimeWindow, Topic, scan
-from sonar_graph.logs.reading import Assembly, describe_frames, read_sonar_frames
+from sonar_graph.logs.reading import Assembly
 from sonar_graph.logs.roles import ROLES, SEQUENCE_ROLES, SONAR, TF, Choice, choose_each, refusal, wanted_types
+from sonar_graph.logs.sonar_images import describe_frames, read_sonar_frames, sonar_frame
 from sonar_graph.logs.vehicle_setup import read_calibration, read_notes, recorded_name, static_frames
 from sonar_graph.measurements import NS_PER_S, Ints
 
 _MOST_FIELDS = 24
-_MOST_FRAMES = 6
 _EXAMPLES = {
     "imu": 'angular_velocity = ["...", "...", "..."]\nlinear_acceleration = ["...", "...", "..."]',
     "dvl": 'velocity = ["...", "...", "..."]',
@@ -100,7 +100,9 @@ class LogSummary:
     warnings: tuple[str, ...] = ()
     """Sentences about what can be read but looks wrong, each after its role."""
     sonar: str | None = None
-    """Size, sector and range of the sonar's first frames."""
+    """Size, sector and range of the sonar's first frames, or why they cannot be read."""
+    sonar_fault: bool = False
+    """True where they cannot be read."""
     toml: str = ""
     """The log configuration to start from; read back unchanged it makes the same choices."""
 
@@ -113,6 +115,17 @@ class LogSummary:
             if role.candidates
             else f"no {role.role.upper()}"
             for role in needed
+        )
+
+    @property
+    def has_images_alone(self) -> bool:
+        """True for a log with sonar images and nothing that may be an IMU or Doppler log."""
+        of = {role.role: role for role in self.roles}
+        needed = [role for role in self.roles if ROLES[role.role].is_required]
+        return (
+            of[SONAR].topic is not None
+            and not self.sonar_fault
+            and not any(role.topic or role.candidates for role in needed)
         )
 
     @property
@@ -181,7 +194,7 @@ def inspect_log(
     )
     damage = [*recording.corrupt, *([recording.ending] if recording.ending else []), *recording.damage.remarks]
     choices = choose_each(recording, topics or {}, config, ROLES)
-    calibration = _calibration_source(recording)
+    mounted: dict[str, str] = {}
     try:
         notes = read_notes(recording)
     except SonarGraphError as error:
@@ -190,30 +203,34 @@ def inspect_log(
     summaries = tuple(_summarise(topic) for topic in recording.topics.values())
     left_out, warnings, unusable = list[str](), list[str](), list[str]()
     try:
-        left_out, warnings = Assembly(recording, {name: choices[name] for name in SEQUENCE_ROLES}).survey()
+        frame = sonar_frame(recording, choices[SONAR].topic, config)
+        assembly = Assembly(recording, {name: choices[name] for name in SEQUENCE_ROLES}, sonar=frame)
+        mounted = assembly.mounted
+        left_out, warnings = assembly.survey()
     except CalibrationError:
         pass  # `calibration` says so
     except SonarGraphError as error:
         unusable.append(str(error))
-    sonar = None
+    sonar, sonar_fault = None, False
     if (sonar_topic := choices[SONAR].topic) is not None:
         try:
             frames = next(read_sonar_frames(recording.path, sonar_topic, config), None)
             sonar = describe_frames(frames) if frames else None
         except SonarGraphError as error:
-            sonar = f"cannot be read: {error}"
+            sonar, sonar_fault = f"cannot be read: {error}", True
     return LogSummary(
         path=recording.path,
         name=recorded_name(recording),
         topics=summaries,
         roles=tuple(RoleSummary(c.role.name, c.topic, c.reason, c.candidates) for c in choices.values()),
-        calibration=calibration,
+        calibration=_calibration_source(recording, mounted),
         notes=notes,
         damage=tuple(damage),
         unusable=tuple(unusable),
         left_out=tuple(left_out),
         warnings=tuple(warnings),
         sonar=sonar,
+        sonar_fault=sonar_fault,
         toml=starting_config(recording, list(choices.values()), config),
     )
 
@@ -269,16 +286,19 @@ def _header_stamps(topic: Topic) -> Ints | None:
     return stamps_ns
 
 
-def _calibration_source(recording: Recording) -> str:
+def _calibration_source(recording: Recording, mounted: Mapping[str, str]) -> str:
+    """Source of the calibration, given the frame of each sensor whose mounting is from ``/tf_static``."""
     try:
-        if read_calibration(recording) is not None:
-            return "in the log"
-        frames = list(static_frames(recording))
+        recorded = read_calibration(recording)
+        has_frames = bool(static_frames(recording))
     except SonarGraphError as error:
         return f"unusable: {error}"
-    if frames:
-        names = ", ".join(frames[:_MOST_FRAMES]) + (", ..." if len(frames) > _MOST_FRAMES else "")
-        return f"none in the log; defaults with the mountings of /tf_static ({names})"
+    of_sensors = ", ".join(name if name == frame else f"{name}: {frame}" for name, frame in mounted.items())
+    mountings = f"mountings of /tf_static ({of_sensors})" if mounted else "no sensor's mounting in /tf_static"
+    if recorded is not None:
+        return f"in the log; {mountings}" if mounted else "in the log"
+    if has_frames:
+        return f"none in the log; defaults with {'the ' if mounted else ''}{mountings}"
     return (
         "none in the log and no /tf_static; defaults, with every sensor at base_link: sonar_graph/calibration.py lists "
         "them with units, comparison.json with the results, and --calibration FILE gives others"

@@ -1,4 +1,4 @@
-"""Reading of logs: a `Sequence` from the topics of an MCAP file, and frames from its sonar images.
+"""Reading of logs: a `Sequence` from the topics of an MCAP file.
 
 The topics are chosen by role (`sonar_graph.logs.roles`), their messages read by adapters (`sonar_graph.logs.adapters`),
 and the calibration is gathered (`sonar_graph.logs.vehicle_setup`). The notes of the sequence, under ``log.*``, say what
@@ -14,7 +14,6 @@ import numpy as np
 from sonar_graph.calibration import Calibration, Mounting
 from sonar_graph.errors import LogError
 from sonar_graph.files import as_path, spelt
-from sonar_graph.images import SonarFrames
 from sonar_graph.logs.adapters import (
     Adapter,
     DepthAdapter,
@@ -25,8 +24,6 @@ from sonar_graph.logs.adapters import (
     LogConfig,
     MessageTable,
     PositionAdapter,
-    Refused,
-    SonarAdapter,
     TruthAdapter,
     changes_text,
     detection_warnings,
@@ -46,8 +43,9 @@ from sonar_graph.logs.checks import (
 )
 from sonar_graph.logs.geodesy import Origin
 from sonar_graph.logs.live_record import leave_out_dropped, recorded_config
-from sonar_graph.logs.mcap import Keep, Progress, Recording, TimeWindow, scan, stream
+from sonar_graph.logs.mcap import Keep, Progress, Recording, TimeWindow, scan
 from sonar_graph.logs.roles import ROLES, SEQUENCE_ROLES, SONAR, Choice, choose_topics, wanted_types
+from sonar_graph.logs.sonar_images import sonar_frame
 from sonar_graph.logs.vehicle_setup import (
     PartialCalibration,
     gathered,
@@ -156,7 +154,9 @@ def read_log(
     if not salvage:
         recording.require_sound()
     left_out = leave_out_dropped(recording)
-    sequence = Assembly(recording, choose_topics(recording, topics or {}, config), calibration).sequence(name)
+    choices = choose_topics(recording, topics or {}, config)
+    frame = sonar_frame(recording, (topics or {}).get(SONAR), config)
+    sequence = Assembly(recording, choices, calibration, frame).sequence(name)
     sequence.notes.update(left_out)
     if window is not None and window.start is not None and recording.beginning_ns is not None:
         late_ns = window.start.resolve(recording.beginning_ns) - recording.beginning_ns
@@ -186,6 +186,8 @@ def _scanned(
 class Assembly:
     """Blocks of measurements from the chosen topics of a log, with an account of rows left out and warnings.
 
+    ``sonar`` is the frame of the sonar that took images (`sonar_frame`).
+
     Raises LogError when no message of a needed topic is what its definition says, and CalibrationError when the
     calibration in the log is invalid, or becomes so by the user's changes.
     """
@@ -195,8 +197,9 @@ class Assembly:
         recording: Recording,
         choices: Mapping[str, Choice],
         calibration: Calibration | PartialCalibration | None = None,
+        sonar: str | None = None,
     ) -> None:
-        self._recording = recording
+        self._recording, self._sonar = recording, sonar
         self.topics = {role: recording.topics[c.topic] for role, c in choices.items() if c.topic is not None}
         self.adapters: dict[str, Any] = {role: c.adapter for role, c in choices.items() if c.adapter is not None}
         self._blocks: dict[str, Any] = {}
@@ -222,6 +225,8 @@ class Assembly:
             self._notes["log.truth"] = choices["truth"].reason
         self._notes |= recording.notes()
         self._is_mounting_known = self._is_start_stated = True
+        self.mounted: dict[str, str] = {}
+        """Frame in ``/tf_static`` of each sensor whose mounting is from there."""
         self.calibration = calibration if isinstance(calibration, Calibration) else self._gathered(calibration)
         if isinstance(calibration, Calibration):
             self._notes["log.calibration"] = "given by the caller"
@@ -229,10 +234,11 @@ class Assembly:
     def _gathered(self, given: PartialCalibration | None) -> Calibration:
         """The calibration of user, record, ``/tf_static`` and defaults, with its sources in the notes."""
         recorded = read_calibration(self._recording)
-        is_recorded = recorded is not None and bool(recorded.model_fields_set - {"sonar"})  # images bring their own
-        self._is_start_stated = is_recorded or bool(given and given.values.get("start"))
-        stated = mounted_by(recorded.model_dump(exclude_unset=True)) if recorded else set()
-        stated |= mounted_by(given.values) if given else set()
+        said = set() if recorded is None else recorded.model_fields_set
+        is_recorded = said | {"start"} == Calibration.model_fields.keys()  # not only what images and `join` bring
+        self._is_start_stated = is_recorded or "start" in said or bool(given and given.values.get("start"))
+        in_record = mounted_by(recorded.model_dump(exclude_unset=True)) if recorded else set()
+        stated = in_record | (mounted_by(given.values) if given else set())
         frames = {
             role: self.adapters[role].frame_in(table.groups)
             for role, table in self._tables.items()
@@ -243,6 +249,8 @@ class Assembly:
                 del frames[role]  # in the world: there is no port or antenna to mount
         if "detections" in self.topics and (messages := self.topics["detections"].messages()):
             frames["sonar"] = self.adapters["detections"].frame_in(messages)
+        elif self._sonar is not None:
+            frames["sonar"] = self._sonar
         tree = static_frames(self._recording)
         mountings = {}
         for name, frame in frames.items():
@@ -254,12 +262,13 @@ class Assembly:
                 found = None
             if found is not None:
                 mountings[name] = found
+        self.mounted = {name: frames[name] for name in mountings if name not in in_record}
         mounted = mountings.keys() | stated
         self._is_mounting_known = "dvl" in mounted
         source = "from the log"
         if not is_recorded:
-            source = "defaults" if recorded is None else "the sonar's from the log; else defaults"
-            source += f"; mountings from /tf_static: {', '.join(mountings) or 'none'}"
+            source = f"{', '.join(sorted(said))} from the log; else defaults" if said else "defaults"
+            source += f"; mountings from /tf_static: {', '.join(self.mounted) or 'none'}"
             missing = [f"{name} ({frame or 'unnamed'})" for name, frame in frames.items() if name not in mounted]
             source += f"; not in the tree, taken as base_link: {', '.join(missing)}" if missing else ""
         if given:
@@ -454,58 +463,3 @@ def unsaid_noise(blocks: Mapping[str, Any], *, only_partly: bool = False) -> Ite
             count = np.count_nonzero(np.isnan(covariances.reshape(len(covariances), -1)).any(axis=1))
             if count and not (only_partly and count == len(covariances)):
                 yield f"{role}: {count} of {len(covariances)} rows say no covariance, {fields} of the calibration count"
-
-
-def read_sonar_frames(
-    path: Path,
-    topic: str | None = None,
-    config: LogConfig | None = None,
-    *,
-    window: TimeWindow | None = None,
-    salvage: bool = False,
-    refused: Refused | None = None,
-) -> Iterator[SonarFrames]:
-    """Read the frames of one sonar in blocks that share beams and bins, holding one chunk of the file at a time.
-
-    Blocks and the frames in them are in the order of the log; a block ends before a frame with an earlier stamp.
-
-    Parameters
-    ----------
-    path
-        An MCAP file.
-    topic
-        Topic of the images, where several fit.
-    config
-        Description of the topics of a foreign log; its table is ``[sonar]``.
-    window, salvage
-        As for `read_log`.
-    refused
-        Called with stamp and reason of each message that is no image; None: the first is an error.
-
-    Raises
-    ------
-    MissingTopicError
-        When the topic that was asked for is not there, or is none that can be read.
-    LogError
-        When several topics fit, the file is damaged in its middle (without ``salvage``, after the last frame), or an
-        image is not what its message says (without ``refused``). A log without sonar images gives no block.
-    """
-    config, path = config or LogConfig(), Path(path)
-    recording = scan(path, lambda _: Keep.NONE)
-    choice = choose_topics(recording, {SONAR: topic} if topic else {}, config, (SONAR,))[SONAR]
-    if choice.topic is None or not isinstance(choice.adapter, SonarAdapter):
-        return
-    kind = recording.topics[choice.topic].type_name
-    for piece in stream(path, lambda name: Keep.ALL if name == kind else Keep.NONE, window, salvage=salvage):
-        if piece.name == choice.topic:
-            yield from choice.adapter.read(piece, refused)
-
-
-def describe_frames(frames: SonarFrames) -> str:
-    """Size, sector and range of a block, in words."""
-    _, beams, bins = frames.intensity.shape
-    left, right = np.degrees([frames.azimuths_rad.max(), frames.azimuths_rad.min()])
-    return (
-        f"{beams} beams x {bins} bins of {frames.intensity.dtype}, azimuth {right:.1f}° to {left:.1f}°, "
-        f"{frames.ranges_m.min():.2f} m to {frames.ranges_m.max():.2f} m"
-    )

@@ -245,10 +245,21 @@ def choose_topics(
                 f"{t.name} ({t.type_name or 'no type'}{f', {reason}' if (reason := refusal(t)) else ''})"
                 for t in recording.topics.values()
             ]
-            needed = " (IMU and Doppler log must both be in the log, for recognising in sonar images too)"
+            needed = " (IMU and Doppler log must both be in the log)"
             raise MissingTopicError(
                 f"{path}: nothing for {name}: {choice.reason}{'' if is_asked_for else needed}; the log has "
                 f"{', '.join(listed) or 'no messages at all'}; describe topics of other types in a log configuration, "
-                f"which `sonar-graph inspect {path} --toml` begins"
+                f"which `sonar-graph inspect {path} --toml` begins{images_alone(recording, config)}"
             )
     return choices
+
+
+def images_alone(recording: Recording, config: LogConfig) -> str:
+    """Words for the end of a sentence about a log that lacks a role, on what its sonar images are good for."""
+    if choose_topic(ROLES[SONAR], recording, config).topic is None:
+        return ""
+    path = recording.path
+    return (
+        f"; `sonar-graph recognise {path}` needs its sonar images only, and `sonar-graph join {path} NAV` brings in "
+        "IMU and Doppler log of another file"
+    )

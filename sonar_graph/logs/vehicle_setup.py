@@ -211,6 +211,25 @@ def recorded_calibration(calibration: Calibration) -> str:
     return calibration.model_dump_json(exclude=exclude)
 
 
+def recorded_fields(path: Path) -> dict[str, Any]:
+    """Fields of a calibration that a log's record states, as JSON has them."""
+    recorded = read_calibration(scan(path, lambda _: Keep.NONE))
+    return {} if recorded is None else recorded.model_dump(mode="json", exclude_unset=True)
+
+
+def static_mounting(path: Path, frame: str) -> Mounting | None:
+    """Mounting of a sensor's frame by a log's ``/tf_static``, or None; errors as of `mounting_of`."""
+    recording = scan(path, lambda kind: Keep.ALL if short_name(kind) == short_name(TF) else Keep.NONE)
+    return mounting_of(frame, static_frames(recording))
+
+
+def with_fields(recorded: Values, *changes: Values) -> str:
+    """JSON of a record's calibration with further fields, of which the later ones count."""
+    for change in changes:
+        recorded = _over(recorded, change)
+    return json.dumps(recorded)
+
+
 NEAREST_ROWS = 5
 """Rows about the start of which the median counts, so that one wrong row does not."""
 WIDER = 3.0
@@ -218,8 +237,8 @@ WIDER = 3.0
 
 
 NO_START = (
-    "not stated, and neither heading nor fixes say it: the world begins at the vehicle with x forward; state it as "
-    "[start] position_m and rpy_rad in a file for --calibration where it matters"
+    "start pose not stated, and neither heading nor fixes say it: the world begins at the vehicle with x forward; "
+    "state it as [start] position_m and rpy_rad in a file for --calibration where it matters"
 )
 
 
@@ -232,7 +251,7 @@ def with_measured_start(calibration: Calibration, blocks: Mapping[str, Any]) -> 
     said = ", ".join(plain_lines(start.model_dump()))
     return (
         calibration.model_copy(update={"start": start}),
-        f"not stated, so by the first headings and fixes: {said}",
+        f"start pose not stated, so by the first headings and fixes: {said}",
     )
 
 

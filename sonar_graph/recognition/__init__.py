@@ -7,10 +7,11 @@ from sonar_graph.recognition.image_motion import ImageMotions, MotionFrom, Plana
 from sonar_graph.recognition.label_server import LabelDesk, LabelServer, shown_frames
 from sonar_graph.recognition.labels import LabelledLog, Labels, calibrate_by_labels, read_labels
 from sonar_graph.recognition.recognition_record import (
-    PICTURE_FOLDER, RECOGNITION, SEE_TRACKS, SURE, DrawnFrame, Recognition, read_recognition, write_recognition,
+    NO_FLOOR, PICTURE_FOLDER, RECOGNITION, SEE_TRACKS, SURE, DrawnFrame, Recognition, read_recognition,
+    write_recognition,
 )
 from sonar_graph.recognition.session import (
-    NO_FLOOR, LandmarkRecogniser, RecognitionSession, one_by_one, recognise, recognise_images, with_detections,
+    LandmarkRecogniser, RecognitionSession, one_by_one, recognise, recognise_images, with_detections,
 )
 from sonar_graph.recognition.track_stories import TrackStories, TrackStory
 

@@ -189,7 +189,10 @@ def calibrate(
     gathered = LabelledSightings(tuple(design.id for design in designs))
     for log, (path, run) in enumerate(logs):
         if run.true_poses is None or run.true_landmarks is None:
-            raise CalibrationError(f"{path}: without true poses and true landmarks nothing in it can be labelled")
+            raise CalibrationError(
+                f"{path}: has no true poses and true landmarks; `sonar-graph label {path} -o labels.json` and "
+                "`calibrate --labels labels.json` measure the model by some twenty clicks"
+            )
         in_log = run.true_landmarks.ids.tolist()
         if not set(gathered.ids) & set(in_log):
             true, known = (", ".join(map(str, sorted(ids))) for ids in (in_log, gathered.ids))

@@ -20,7 +20,7 @@ import numpy as np
 from sonar_graph.calibration import SonarCalibration
 from sonar_graph.images import SonarFrames, decibels
 from sonar_graph.recognition.image_motion import is_alike
-from sonar_graph.recognition.labels import Label, Labels
+from sonar_graph.recognition.labels import Label, Labels, is_of_one_object
 from sonar_graph.recognition.recognition_record import as_jpeg, draw_fan
 from sonar_graph.recognition.session import one_by_one
 from sonar_graph.sonar import Fan, with_lens
@@ -96,13 +96,13 @@ class LabelDesk:
         return {"frames": rows, "counts": {str(key): ids.count(key) for key in set(ids)}, "total": len(ids)}
 
     def add(self, frame: int, column: float, row: float, landmark: int | None) -> str | None:
-        """Give a label to a pixel; the reason where that cannot be."""
+        """Give a label to a pixel, instead of one that is of the same object; the reason where that cannot be."""
         place = self.frames[frame].range_azimuth(column, row)
         if place is None:
             return "outside of the image"
         label = Label(stamp_ns=self.frames[frame].stamp_ns, range_m=place[0], azimuth_rad=place[1], id=landmark)
         with self._lock:
-            self._write((*self.labels, label))
+            self._write((*(one for one in self.labels if not is_of_one_object(one, label)), label))
         return None
 
     def take_back(self, frame: int) -> str | None:

@@ -13,12 +13,12 @@ A click errs by a centimetre, more than the recogniser does. With the distance d
 median one of the track's sightings, and V the variance of such means by the scatter of the labels of a track (that of
 `CLICK_SIGMA_M` where no track has two), the true place is taken as the sightings' plus
 ``max(0, 1 - mean V / mean d^2) d`` (James and Stein 1961): labels tell an error that all tracks share only as far as it
-exceeds their own.
+exceeds their own. Errors of the motion that carries a place add to the model's sigmas, which so are rather too large.
 """
 
 import csv
 import json
-from collections import defaultdict, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -51,7 +51,7 @@ MOST_ROWS = 8
 """Rows of labels that a message lists."""
 OUTSIDE, NO_FRAME, UNUSED = "outside of the image", "no such frame", "of a frame that was not used"
 IN_DEGREES = "outside of the image, but not if the azimuth is in degrees; expected radians"
-NO_TRACK, CONTRADICTED = "no track there", "on a track that has other labels too"
+NO_TRACK, CONTRADICTED = "no track there", "contradicts other labels of its track, so left out"
 """Why labels tell nothing."""
 NOWHERE = np.array([-1]), np.array([1e9]), np.array([0.0])
 """True landmarks around what is none: one that is far away."""
@@ -111,7 +111,11 @@ def read_labels(path: Path, log: Path) -> Labels:
         raise CalibrationError(
             f"{path}: {error}; expected JSON as `sonar-graph label` writes it, or CSV with {', '.join(COLUMNS)}"
         ) from error
-    labels = parse(Labels, content, str(path))
+    try:
+        labels = parse(Labels, content, str(path))
+    except CalibrationError as error:
+        hint = "; angles are in rad, and these seem to be in degrees" if "azimuth_rad: expected" in str(error) else ""
+        raise CalibrationError(f"{error}{hint}") from error
     if labels.log != spelt(log.name):
         raise CalibrationError(f"{path}: its labels are of {labels.log}, not of {log.name}; name the log they are of")
     return labels
@@ -136,9 +140,28 @@ class LabelledTrack:
     """Each after its stamp and the pose of the sonar, with the independent share of the frame."""
     seen: list[Floats] = field(default_factory=list)
     """Places of the sightings."""
-    ids: set[int | None] = field(default_factory=set)
+    labels: list[tuple[int, Label]] = field(default_factory=list)
+    """Each after its row (from 1)."""
     labelled: list[Floats] = field(default_factory=list)
     """Places of the labels."""
+
+    @property
+    def ids(self) -> set[int | None]:
+        """Identities of the labels."""
+        return {label.id for _, label in self.labels}
+
+    def drop_contradictions(self) -> list[int]:
+        """Leave out several identities in one frame, and those that fewer than half of the rest say; their rows."""
+        said_at: dict[int, set[int | None]] = defaultdict(set)
+        for _, label in self.labels:
+            said_at[label.stamp_ns].add(label.id)
+        sound = [label.id for _, label in self.labels if len(said_at[label.stamp_ns]) == 1]
+        most = [landmark for landmark, count in Counter(sound).items() if 2 * count > len(sound)]
+        kept = [label.id in most and len(said_at[label.stamp_ns]) == 1 for _, label in self.labels]
+        dropped = [row for (row, _), is_kept in zip(self.labels, kept, strict=True) if not is_kept]
+        self.labelled = [place for place, is_kept in zip(self.labelled, kept, strict=True) if is_kept]
+        self.labels = [label for label, is_kept in zip(self.labels, kept, strict=True) if is_kept]
+        return dropped
 
     def off(self) -> Floats:
         """Mean place of the labels from `middle`, shape (3,)."""
@@ -210,7 +233,7 @@ def calibrate_by_labels(
                 f"{one.file}: no frame of {one.path.name} has the stamp of any label; are these labels of another log?"
             )
         provenance[f"labels {log}"] = f"{spelt(one.file.name)}: {what_labels_met(given, unmet)}"
-        # those that nobody labelled, and those of two landmarks, tell nothing
+        # those that nobody labelled tell nothing
         sure = {number: track for number, track in tracks.items() if len(track.ids) == 1}
         known = [track for track in sure.values() if track.ids != {None}]
         share = trusted_share(known) if known else 0.0
@@ -249,7 +272,6 @@ def _labelled_tracks(
     session = RecognitionSession(log.run, recogniser=recogniser, pictures=False, motion=log.motion, seen=used.append)
     tracks: dict[int, LabelledTrack] = defaultdict(LabelledTrack)
     unmet: dict[str, list[int]] = defaultdict(list)
-    row_of: dict[int, list[int]] = defaultdict(list)
     by_stamp: dict[int, list[tuple[int, Label]]] = defaultdict(list)
     for row, label in enumerate(log.labels.labels, 1):
         by_stamp[label.stamp_ns].append((row, label))
@@ -269,16 +291,15 @@ def _labelled_tracks(
             away = {number: _distance(sighting, label) for number, sighting in seen.items()}
             nearest = min(away, key=lambda number: away[number], default=None)
             if nearest is not None and away[nearest] <= NEAR_M:
-                tracks[nearest].ids.add(label.id)
+                tracks[nearest].labels.append((row, label))
                 tracks[nearest].labelled.append(place_of(label.range_m, label.azimuth_rad, session))
-                row_of[nearest].append(row)
             else:
                 in_radians = label.model_copy(update={"azimuth_rad": np.radians(label.azimuth_rad)})
                 places = {NO_TRACK: label, IN_DEGREES: in_radians} if used else {}
                 reason = next((said for said, at in places.items() if _is_within(used[0], at)), OUTSIDE)
                 unmet[reason].append(row)
     unmet[NO_FRAME] = [row for labels in by_stamp.values() for row, _ in labels]
-    unmet[CONTRADICTED] = [row for number, rows in row_of.items() if len(tracks[number].ids) > 1 for row in rows]
+    unmet[CONTRADICTED] = [row for track in tracks.values() for row in track.drop_contradictions()]
     return tracks, unmet
 
 
@@ -289,6 +310,12 @@ def _is_within(frame: SonarFrames, label: Label) -> bool:
         frame.ranges_m.min() - half_bin <= label.range_m <= frame.ranges_m.max() + half_bin
         and frame.azimuths_rad.min() - half_beam <= label.azimuth_rad <= frame.azimuths_rad.max() + half_beam
     )
+
+
+def is_of_one_object(one: Label, other: Label) -> bool:
+    """True for labels of one frame as near to each other as no two objects are."""
+    across = one.range_m * (one.azimuth_rad - other.azimuth_rad)
+    return one.stamp_ns == other.stamp_ns and bool(np.hypot(one.range_m - other.range_m, across) <= NEAR_M / 2)
 
 
 def _distance(sighting: ObjectSighting, label: Label) -> float:

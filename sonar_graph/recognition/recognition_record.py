@@ -24,6 +24,10 @@ NONE = -1
 LEAST_NAMED = 0.5
 """Posterior above which a detection counts as naming a landmark."""
 
+NO_FLOOR = "frame without a known floor: compared with the designs in the plane of the image"
+OFF_FLOOR = "frame in which no floor can be: by mounting and tilt the sonar looks past it"
+LACKS = "detections.floor"
+"""Note of what is lacking for a known floor."""
 FEWEST_TRACKS, MOSTLY = 10, 0.9
 """Number of reported tracks, and share of them without a landmark, from which images are doubted."""
 SEE_TRACKS = "`sonar-graph recognise --report PAGE.html` shows the tracks"
@@ -77,11 +81,20 @@ class Recognition:
             ids, probability = self.detections.most_probable()
             named.update(np.where(probability > LEAST_NAMED, ids, NONE).tolist())
         counts = [f"landmark {i}: {n}" for i, n in sorted(named.items()) if i != NONE]
-        lines = [f"Most probable: {', '.join([*counts, f'none of them: {named[NONE]}'])}"] if named else []
+        looked_for = set() if self.detections is None else set(np.unique(self.detections.candidate_ids).tolist())
+        never = ", ".join(map(str, sorted(looked_for - named.keys())))
+        said = [*counts, f"none of them: {named[NONE]}"]
+        lines = [f"Most probable: {', '.join(said)}{f'; never: landmark {never}' if never else ''}"] if named else []
         if not counts:
             designs = self.notes.get("detections.designs", "those given")
             lines.append(f"Warning: no landmark was recognised; looked for {designs}; --designs gives others")
-        looked_for = set() if self.detections is None else set(np.unique(self.detections.candidate_ids).tolist())
+        if LACKS in self.notes:
+            lines.append(f"Warning: {self.notes[LACKS]}")
+        if 2 * self.outcomes[OFF_FLOOR] > self.frames:
+            lines.append(
+                f"Warning: in {self.outcomes[OFF_FLOOR]} of {self.frames} frames the sonar looks past the floor: check "
+                "[sonar.mounting] (a positive pitch turns it down), [floor] and sonar.elevation_aperture_rad"
+            )
         if true_landmarks is not None and looked_for:
             unknown = sorted(set(true_landmarks.ids.tolist()) - looked_for)
             if unknown:

@@ -18,14 +18,22 @@ import numpy as np
 from sonar_graph.calibration import Calibration
 from sonar_graph.devices import LandmarkDesign
 from sonar_graph.errors import LogError, MeasurementError
-from sonar_graph.images import SonarFrames, decibels
+from sonar_graph.images import NO_DEPTH, NO_HEIGHT, NO_TILT, SonarFrames, decibels
 from sonar_graph.logs import ImagesAlone, PartialCalibration, read_log, read_sonar_frames
 from sonar_graph.logs import no_images as no_images
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.logs.mcap import TimeWindow
 from sonar_graph.measurements import NS_PER_S, Depth, Dvl, Imu, LandmarkDetections
 from sonar_graph.recognition.image_motion import ImageMotions, MotionFrom
-from sonar_graph.recognition.recognition_record import DrawnFrame, Recognition, as_jpeg, draw_fan
+from sonar_graph.recognition.recognition_record import (
+    LACKS,
+    NO_FLOOR,
+    OFF_FLOOR,
+    DrawnFrame,
+    Recognition,
+    as_jpeg,
+    draw_fan,
+)
 from sonar_graph.recognition.sonar_motion import SonarMotions
 from sonar_graph.sequence import Sequence as Run
 from sonar_graph.sonar import EVIDENCE, Fan, Fate, FloorView, Recogniser, RecogniserParams, SonarStep, with_lens
@@ -36,7 +44,6 @@ PICTURE_PERIOD_NS = NS_PER_S
 NOT_USED = "frame not used"
 OUT_OF_ORDER = "out of order"
 LEAPT = "out of order: its stamp is ahead of the frame after it"
-NO_FLOOR = "frame without a known floor: compared with the designs in the plane of the image"
 NO_ODOMETRY = "no IMU and Doppler log at its stamp"
 
 
@@ -119,12 +126,11 @@ def recognise(
     >>> run = recognise((block.frames for block in blocks), simulate_basin(options))
     >>> ids, probability = run.detections.most_probable()
     """
-    others = {role: topic for role, topic in (topics or {}).items() if role != "sonar"}
     if sequence is None:
         if not isinstance(images, Path | str):
             raise MeasurementError("recognise: frames need a sequence with IMU and DVL; give one, or the path of a log")
         sequence = read_log(
-            Path(images), calibration=calibration, topics=others, config=config, window=window, salvage=salvage
+            Path(images), calibration=calibration, topics=topics, config=config, window=window, salvage=salvage
         )
     found = recognise_images(
         images,
@@ -229,6 +235,9 @@ class RecognitionSession:
         self.view: FloorView | None = None
         """View of the floor at the last frame, where it is known."""
         self._sonar = sequence.calibration.sonar
+        has_depth = getattr(sequence, "depth", None) is not None
+        lacking = NO_HEIGHT if sequence.calibration.floor is None else "" if has_depth else NO_DEPTH
+        self._lacks = lacking if motion == "navigation" else NO_TILT
         self._motions: SonarMotions | ImageMotions
         if motion == "navigation" and isinstance(sequence, Run):
             self._motions = SonarMotions(sequence)
@@ -273,6 +282,7 @@ class RecognitionSession:
             self.start_T_sonar = self.start_T_sonar.compose(step.previous_T_sonar)
         frame = with_lens(frame, self._sonar.lens)
         self.result.outcomes[NO_FLOOR] += view is None
+        self.result.outcomes[OFF_FLOOR] += view is not None and not self._may_show_floor(frame, view)
         found = self.recogniser.process(frame, step, view)
         is_used = True
         for fate in self.recogniser.fates:
@@ -307,6 +317,8 @@ class RecognitionSession:
         result.notes = {"detections": f"recognised in {result.frames} sonar images"} | self.recogniser.notes()
         if isinstance(self._motions, ImageMotions):
             result.notes |= self._motions.notes()
+        if self._lacks and result.outcomes[NO_FLOOR]:
+            result.notes[LACKS] = self._lacks
         if isinstance(self.recogniser, Recogniser) and (usual := self.recogniser.confusion.roughness) is not None:
             means = [total / count for total, count in self._beyond.values()]
             result.unlike = sum(not usual[0] <= mean <= usual[1] for mean in means), len(means)
@@ -315,6 +327,13 @@ class RecognitionSession:
         if result.warnings:
             result.notes["detections.warnings"] = "; ".join(f"{n} x {reason}" for reason, n in result.warned().items())
         return result
+
+    def _may_show_floor(self, frame: SonarFrames, view: FloorView) -> bool:
+        """Tell whether the floor lies within the vertical aperture at any range ahead."""
+        ranges_m = frame.ranges_m
+        q = view.floor_points(ranges_m, np.full(len(ranges_m), float(np.median(frame.azimuths_rad))))
+        elevation_rad = np.arcsin(q[:, 2] / ranges_m)
+        return bool((np.abs(elevation_rad) <= self._sonar.elevation_aperture_rad / 2).any())
 
     def _warn(self, stamp_ns: int, reason: str) -> None:
         if len(self.result.warnings) < MOST_WARNINGS or reason not in self.result.outcomes:

@@ -198,6 +198,11 @@ def read_confusion(path: Path) -> Confusion:
                 f"{path}: across_bound_m: missing; it is a model of an earlier version without the bounds of the fit's "
                 "accuracy across; measure it again with sonar-graph calibrate"
             )
+        if isinstance(values, dict) and values.keys() == {"log", "labels"}:
+            raise CalibrationError(
+                f"{path}: is a file of labels; `sonar-graph calibrate LOG --labels {path} -o model.json` makes a model "
+                "of them"
+            )
         return Confusion.model_validate(values)
     except OSError as error:
         raise CalibrationError(f"{path} cannot be read: {error.strerror}") from error

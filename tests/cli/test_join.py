@@ -6,11 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
 
-from sonar_graph.calibration import Calibration, SonarCalibration, SonarImage
+from sonar_graph.calibration import Calibration, FloorPrior, Mounting, SonarCalibration, SonarImage
 from sonar_graph.logs.mcap.writer import recording
-from sonar_graph.logs.reading import read_log, read_sonar_frames
-from sonar_graph.logs.vehicle_setup import METADATA, recorded_calibration
+from sonar_graph.logs.reading import read_log
+from sonar_graph.logs.sonar_images import read_sonar_frames
+from sonar_graph.logs.vehicle_setup import METADATA
 from sonar_graph.logs.writing import sonar_image_messages, write_log
 from tests.logs.converters.sonar_recordings import Aris, images
 from tests.recognition.imaged_lane import TOPIC, Lane
@@ -22,7 +25,8 @@ def images_log(lane: Lane, path: Path, offset_s: float = OFFSET_S) -> Path:
     """The images by a clock that is behind, in a log that says what their samples mean."""
     calibration = Calibration(sonar=SonarCalibration(image=SonarImage(decibel_span=75.0)))
     frames = replace(lane.frames, stamps_ns=lane.frames.stamps_ns - round(offset_s * 1e9))
-    with recording(path, {METADATA: {"calibration": recorded_calibration(calibration)}}) as writer:
+    own = calibration.model_dump_json(exclude_unset=True)
+    with recording(path, {METADATA: {"calibration": own}}) as writer:
         writer.write([sonar_image_messages(TOPIC, frames)])
     return path
 
@@ -52,6 +56,51 @@ def test_images_come_onto_the_clock_of_the_navigation_with_all_else_as_it_was(la
     assert joined.calibration.sonar.mounting == expected.sonar.mounting
     assert joined.calibration.sonar.image.decibel_span == 75.0
     assert joined.calibration.model_copy(update={"sonar": expected.sonar}) == expected
+
+
+@pytest.fixture(scope="module")
+def bare(lane, tmp_path_factory) -> Path:
+    """Navigation as another program writes it: mountings in ``/tf_static``, and no record of this package."""
+    folder = tmp_path_factory.mktemp("bare")
+    write_log(folder / "whole.mcap", lane.sequence)
+    with (folder / "whole.mcap").open("rb") as stream, (folder / "nav.mcap").open("wb") as out:
+        writer, channels = Writer(out), {}
+        writer.start()
+        for schema, channel, message in make_reader(stream).iter_messages():
+            if channel.topic not in channels:
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.topic] = writer.register_channel(
+                    channel.topic, channel.message_encoding, number, channel.metadata
+                )
+            writer.add_message(channels[channel.topic], message.log_time, message.data, message.publish_time)
+        writer.finish()
+    return folder / "nav.mcap"
+
+
+def test_the_mounting_of_the_sonar_is_that_of_the_navigations_frames(lane, both, bare, run, tmp_path):
+    out, expected = tmp_path / "joined.mcap", lane.sequence.calibration.sonar.mounting
+    assert expected != Mounting()
+    assert run("join", both[0], bare, "-o", out, "--offset", OFFSET_S) == 0
+    joined = read_log(out)
+    np.testing.assert_allclose(joined.calibration.sonar.mounting.translation_m, expected.translation_m, atol=1e-12)
+    np.testing.assert_allclose(joined.calibration.sonar.mounting.rpy_rad, expected.rpy_rad, atol=1e-12)
+    assert joined.calibration.sonar.image.decibel_span == 75.0
+    assert "not stated" in joined.notes["log.start"]
+
+
+def test_mounting_floor_and_start_of_a_given_file_are_in_the_joined_log(both, bare, run, tmp_path):
+    given, out = tmp_path / "vehicle.toml", tmp_path / "joined.mcap"
+    given.write_text(
+        "[floor]\nz_m = -3.0\nsigma_m = 0.02\n[start]\nposition_m = [1.0, 2.0, -0.5]\n"
+        "[sonar.mounting]\nrpy_rad = [0.0, 0.3, 0.0]\n"
+    )
+    for navigation in (bare, both[1]):
+        assert run("join", both[0], navigation, "-o", out, "--offset", OFFSET_S, "--calibration", given) == 0
+        found = read_log(out).calibration
+        assert found.floor == FloorPrior(z_m=-3.0, sigma_m=0.02)
+        assert found.start.position_m == (1.0, 2.0, -0.5)
+        assert found.sonar.mounting.rpy_rad == (0.0, 0.3, 0.0)
+        assert found.dvl.mounting.rpy_rad == pytest.approx(read_log(navigation).calibration.dvl.mounting.rpy_rad)
 
 
 def test_a_stated_offset_is_taken_and_doubted_where_the_images_say_else(lane, both, run, tmp_path, capsys):

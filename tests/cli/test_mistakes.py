@@ -124,7 +124,7 @@ MISTAKES = {
     "compare lane.mcap -o out --rule bayes": r"settings of the recogniser: identity\.rule: .*virtual-evidence.*jeffrey",
     "compare lane.mcap -o out --designs broken.toml": r"broken\.toml.*size_m",
     "calibrate bare.mcap -o new.mcap": r"ends in \.json",
-    "calibrate blind.mcap -o new.json": r"blind\.mcap: without true poses and true landmarks",
+    "calibrate blind.mcap -o new.json": r"blind\.mcap: has no true poses and true.*label .*--labels",
     "calibrate bare.mcap -o new.json": r"bare\.mcap: has no sonar images",
     "calibrate lane.mcap lane.mcap -o new.json": r"lane\.mcap: is named twice.*name each log once",
     "calibrate lane.mcap -o new.json --designs strange.toml": "true landmarks are 1, 2, 3, 4, the designs are 9: ",

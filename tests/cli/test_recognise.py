@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 
 from sonar_graph.logs.mcap.writer import recording
 from sonar_graph.logs.reading import read_log
-from sonar_graph.logs.writing import sonar_image_messages
+from sonar_graph.logs.writing import sonar_image_messages, write_log
 from sonar_graph.recognition import confusion_fit
 from sonar_graph.sonar.confusion import read_confusion
 from tests.recognition.imaged_lane import TOPIC
@@ -176,17 +176,51 @@ def test_images_alone_are_recognised_and_what_is_lost_is_said(lane, run, tmp_pat
     assert "no IMU and no DVL in the log; leave --motion out" in capsys.readouterr().err
     (tmp_path / "over.json").write_text(lane.sequence.calibration.model_dump_json(exclude_unset=True))
     for more, said in (
-        ((), "height and tilt are not known, so that designs are compared in the plane of the image; a file for "),
-        (("--motion", "fixed"), "motion none: the sonar is taken to be at rest"),
-        (("--calibration", tmp_path / "over.json"), "height and tilt are taken to stay those of the calibration's"),
+        ((), "Warning: height and tilt are not known: landmarks are compared in the plane of the image"),
+        (("--motion", "fixed"), "Without navigation: motion none: the sonar is taken to be at rest"),
+        (
+            ("--calibration", tmp_path / "over.json"),
+            "Without navigation: height and tilt are taken to stay those of the calibration's",
+        ),
     ):
         assert run("recognise", log, "-o", out, *more) == 0
         lines = capsys.readouterr().out
-        assert f"Without navigation: {said}" in lines
+        assert said in lines
         assert "no estimator can run on the images alone; `sonar-graph join`" in lines
+    assert run("inspect", log) == 3
+    assert f"sonar-graph recognise {log} -o recognised.mcap" in capsys.readouterr().out
+    assert run("compare", log, "-o", tmp_path / "compared") == 2
+    assert f"`sonar-graph recognise {log}` needs its sonar images only" in capsys.readouterr().err
     with out.open("rb") as stream:
         topics = {channel.topic for _, channel, _ in make_reader(stream).iter_messages()}
     assert topics == {TOPIC, "/sonar/landmarks"}
+
+
+def test_who_recognises_without_a_floor_or_past_it_is_told(lane, lane_log, run, tmp_path, capsys):
+    out, given = tmp_path / "out.mcap", tmp_path / "given.toml"
+    for text in ("floor = false", "[sonar.mounting]\nrpy_rad = [0.0, 0.0, 0.0]", ""):
+        given.write_text(text)
+        assert run("recognise", lane_log, "-o", out, "--calibration", given) == 0
+        lines = capsys.readouterr().out
+        assert ("floor is not known: landmarks" in lines) == text.startswith("floor")
+        assert ("looks past the floor: check [sonar.mounting]" in lines) == text.startswith("[sonar")
+    assert run("recognise", lane_log, "-o", out, "--motion", "fixed") == 0
+    lines = capsys.readouterr().out
+    assert "the log's IMU and Doppler log are not used, as --motion fixed asks" in lines
+    assert "sonar-graph join" not in lines
+
+
+def test_labels_in_the_place_of_a_model_and_a_log_without_truth_are_told_the_way(lane_log, run, tmp_path, capsys):
+    labels, log = tmp_path / "labels.json", tmp_path / "bare.mcap"
+    labels.write_text('{"log": "x.mcap", "labels": []}')
+    assert run("recognise", lane_log, "-o", tmp_path / "out.mcap", "--model", labels) == 2
+    assert f"`sonar-graph calibrate LOG --labels {labels} -o model.json` makes a model" in capsys.readouterr().err
+    write_log(log, replace(read_log(lane_log), truth=None, true_landmarks=None))
+    assert run("calibrate", log, "-o", tmp_path / "model.json") == 2
+    assert "`calibrate --labels labels.json` measure the model" in capsys.readouterr().err
+    labels.write_text('{"log": "bare.mcap", "labels": [{"stamp_ns": 1, "range_m": 2, "azimuth_rad": 9, "id": 1}]}')
+    assert run("calibrate", log, "-o", tmp_path / "model.json", "--labels", labels) == 2
+    assert "these seem to be in degrees" in capsys.readouterr().err
 
 
 def test_a_page_of_the_tracks_is_written_and_replaces_only_its_own(lane_log, run, tmp_path, capsys):

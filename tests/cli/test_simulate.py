@@ -10,7 +10,8 @@ from mcap.stream_reader import StreamReader
 from typer.testing import CliRunner
 
 from sonar_graph.cli.main import app
-from sonar_graph.logs.reading import read_log, read_sonar_frames
+from sonar_graph.logs.reading import read_log
+from sonar_graph.logs.sonar_images import read_sonar_frames
 from sonar_graph.logs.writing import write_log
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin, simulate_basin_frames
 from sonar_graph.simulation.landmarks_on_log import LandmarkOptions, add_landmarks

@@ -12,8 +12,8 @@ from sonar_graph.images import SonarFrames
 from sonar_graph.logs.mcap.file_summary import Instant, TimeWindow
 from sonar_graph.logs.reading import read_log
 from sonar_graph.logs.writing import sonar_image_messages, write_log
-from sonar_graph.recognition.recognition_record import Recognition
-from sonar_graph.recognition.session import LEAPT, NO_FLOOR, recognise_images
+from sonar_graph.recognition.recognition_record import NO_FLOOR, Recognition
+from sonar_graph.recognition.session import LEAPT, recognise_images
 from tests.recognition.imaged_lane import TOPIC, Lane
 
 COUNT = 70

@@ -44,7 +44,7 @@ def test_rates_and_gaps_come_from_the_headers_and_mountings_are_mentioned(bench:
     assert (found.first_stamp_ns, found.last_stamp_ns) == (bench.t0_ns, bench.t0_ns + 5 * 10**9)
     assert (found.rate_hz, found.largest_gap_s, summary.duration_s) == pytest.approx((3 / 5, 3, 5))
     assert (found.stamps_from, topic(summary, "/tf_static").stamps_from) == ("header", "log")
-    assert "mountings of /tf_static (imu_link)" in summary.calibration
+    assert "mountings of /tf_static (imu: imu_link)" in summary.calibration
 
 
 def test_roles_are_explained_whether_filled_or_not(bench: Bench) -> None:

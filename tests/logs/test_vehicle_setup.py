@@ -12,13 +12,24 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonar_graph.calibration import Calibration, DepthCalibration, DvlCalibration, ImuCalibration, Mounting, Start
+from sonar_graph.calibration import (
+    Calibration,
+    DepthCalibration,
+    DvlCalibration,
+    ImuCalibration,
+    Mounting,
+    SonarCalibration,
+    Start,
+)
 from sonar_graph.errors import CalibrationError, LogError
+from sonar_graph.images import SonarFrames
+from sonar_graph.logs.inspection import inspect_log
 from sonar_graph.logs.mcap.scanning import scan
 from sonar_graph.logs.mcap.topic import Keep
 from sonar_graph.logs.mcap.writer import write_recording
 from sonar_graph.logs.reading import read_log
 from sonar_graph.logs.roles import TF
+from sonar_graph.logs.sonar_images import read_images_alone
 from sonar_graph.logs.vehicle_setup import (
     METADATA,
     PartialCalibration,
@@ -27,7 +38,7 @@ from sonar_graph.logs.vehicle_setup import (
     mounting_of,
     static_frames,
 )
-from sonar_graph.logs.writing import dvl_messages, imu_messages, static_message, write_log
+from sonar_graph.logs.writing import dvl_messages, imu_messages, sonar_image_messages, static_message, write_log
 
 TREE_M = (1.0, 2.0, 3.0)
 FLOOR = Calibration.model_validate({"floor": {"z_m": -1, "sigma_m": 0.1}})
@@ -63,6 +74,30 @@ def test_mountings_survive_tf_static(
     assert found.dvl.mounting.pose().equals(mounting.pose(), 1e-9)
     assert found.imu.mounting.pose().equals(gtsam.Pose3(), 1e-9)
     assert mounting_of("depth", static_frames(scan(path, lambda _: Keep.ALL))).translation_m == port
+
+
+def test_the_sonar_of_images_is_mounted_where_tf_static_says_without_detections(
+    make_sequence: Any, tmp_path: Path
+) -> None:
+    sequence, mounting = replace(make_sequence(), detections=None), Mounting(rpy_rad=(0.0, 0.5, 0.0))
+    frames = SonarFrames(
+        sequence.imu.stamps_ns[:2], np.zeros((2, 3, 4), np.uint8), np.arange(1.0, 5), np.array([0.1, 0.0, -0.1])
+    )
+    messages = [
+        static_message("/tf_static", TF, 0, encode_mountings(Calibration(sonar=SonarCalibration(mounting=mounting)))),
+        imu_messages("/imu", sequence.imu),
+        dvl_messages("/dvl", sequence.dvl),
+        sonar_image_messages("/sonar/image", frames),
+    ]
+    write_recording(tmp_path / "a.mcap", messages, {})
+    found = read_log(tmp_path / "a.mcap")
+    np.testing.assert_allclose(found.calibration.sonar.mounting.rpy_rad, mounting.rpy_rad, atol=1e-12)
+    assert found.notes["log.calibration"].startswith("defaults; mountings from /tf_static: imu, dvl, sonar")
+    assert inspect_log(tmp_path / "a.mcap").calibration.endswith("mountings of /tf_static (imu, dvl, sonar)")
+    alone = read_images_alone(tmp_path / "a.mcap").calibration.sonar
+    np.testing.assert_allclose(alone.mounting.rpy_rad, mounting.rpy_rad, atol=1e-12)
+    stated = read_images_alone(tmp_path / "a.mcap", calibration=said(sonar={"mounting": {"rpy_rad": [0.0, 0.0, 1.0]}}))
+    assert stated.calibration.sonar.mounting.rpy_rad == (0.0, 0.0, 1.0)
 
 
 def test_a_frame_that_does_not_hang_on_the_body_has_no_mounting() -> None:

@@ -24,7 +24,8 @@ from sonar_graph.images import SonarFrames
 from sonar_graph.logs.mcap.file_summary import read_summary
 from sonar_graph.logs.mcap.records import LogFile, open_seal
 from sonar_graph.logs.mcap.writer import Attachment, Outgoing, recording, write_recording
-from sonar_graph.logs.reading import read_log, read_sonar_frames
+from sonar_graph.logs.reading import read_log
+from sonar_graph.logs.sonar_images import read_sonar_frames
 from sonar_graph.logs.writing import pose_messages, sonar_image_messages, static_message, write_log
 from sonar_graph.measurements import Imu
 from sonar_graph.states import Trajectory

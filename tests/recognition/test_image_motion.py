@@ -8,8 +8,8 @@ import pytest
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.images import SonarFrames
-from sonar_graph.logs.images_alone import ImagesAlone, lacking_navigation, read_images_alone
 from sonar_graph.logs.reading import read_log
+from sonar_graph.logs.sonar_images import ImagesAlone, lacking_navigation, read_images_alone
 from sonar_graph.logs.writing import write_log
 from sonar_graph.measurements import Floats
 from sonar_graph.recognition.image_motion import ImageMotions

@@ -138,11 +138,17 @@ def test_each_click_is_saved_and_can_be_taken_back(server, tmp_path):
 
 def test_the_last_label_of_a_frame_is_taken_back(server):
     desk = server.desk
-    column, row = desk.frames[1].fan.pixel(1.8, 0.0)
-    for landmark in (2, 3, 1):
-        assert desk.add(1, column, row, landmark) is None
+    for landmark, range_m in ((2, 1.5), (3, 1.8), (1, 2.1)):
+        assert desk.add(1, *desk.frames[1].fan.pixel(range_m, 0.0), landmark) is None
     assert desk.take_back(1) is None
     assert [label.id for label in desk.labels] == [2, 3]
+
+
+def test_a_label_on_one_of_the_same_frame_takes_its_place(server):
+    desk = server.desk
+    for frame, landmark, range_m in ((1, 2, 1.5), (1, 3, 1.8), (2, 4, 1.5), (1, 1, 1.52)):
+        assert desk.add(frame, *desk.frames[frame].fan.pixel(range_m, 0.0), landmark) is None
+    assert [label.id for label in desk.labels] == [3, 4, 1]
 
 
 def test_what_cannot_be_saved_is_said_and_not_kept(server, monkeypatch):
@@ -177,7 +183,7 @@ def test_landmarks_are_clicked_in_a_browser_and_the_command_ends_by_ctrl_c_and_g
         assert (command.returncode, complaints) == (0, "")
         assert f"Labels: {out} ({before + 2})" in said
     ids = [label.id for label in read_labels(out, lane_log).labels]
-    assert ids == [3, None, 3, None]
+    assert ids == [None, 3, None, 3]
 
 
 def click_two(browser, address: str, before: int) -> None:
@@ -190,10 +196,12 @@ def click_two(browser, address: str, before: int) -> None:
     until(lambda: page.evaluate("document.getElementById('picture').naturalWidth") > 0)
     if before:
         until(lambda: status.text_content() == f"{before} labels so far")
-    page.keyboard.press("ArrowRight")
+    frame = 1 + before // 2
+    for _ in range(frame):
+        page.keyboard.press("ArrowRight")
     page.keyboard.press("PageDown")
     page.keyboard.press("PageUp")
-    assert page.locator("#where").text_content().startswith("2 of ")
+    until(lambda: page.locator("#where").text_content().startswith(f"{frame + 1} of "))
     page.keyboard.press("3")
     assert page.locator("input[value='3']").is_checked()
     box = page.locator("#picture").bounding_box()
@@ -201,15 +209,27 @@ def click_two(browser, address: str, before: int) -> None:
     page.mouse.click(*middle)
     until(lambda: status.text_content() == f"saved: {before + 1} labels")
     page.keyboard.press("0")
-    page.mouse.click(middle[0], middle[1] + 40)
-    page.mouse.click(middle[0], middle[1] + 60)
+    page.mouse.click(middle[0], middle[1] + 90)
+    page.mouse.click(middle[0], middle[1] - 90)
     until(lambda: status.text_content() == f"saved: {before + 3} labels")
     page.keyboard.press("Backspace")
     until(lambda: status.text_content() == f"saved: {before + 2} labels")
-    assert page.locator("#marks circle").count() == before + 2
-    mark = page.locator("#marks circle").nth(before).bounding_box()
+    assert page.locator("#marks circle").count() == 2
+    mark = page.locator("#marks circle").nth(0).bounding_box()
     assert abs(mark["x"] + mark["width"] / 2 - middle[0]) < 3
     assert abs(mark["y"] + mark["height"] / 2 - middle[1]) < 3
+    held: list = []
+    page.route(f"**/frame/{frame + 1}", lambda route: held.append(route))  # a picture that is long in coming
+    page.keyboard.press("ArrowRight")
+    until(lambda: page.locator("#frame").input_value() == f"{frame + 1}")
+    page.keyboard.press("3")
+    page.mouse.click(*middle)  # of the picture that is shown, whose label it replaces
+    page.wait_for_timeout(200)
+    assert page.locator("#where").text_content().startswith(f"{frame + 1} of ")
+    assert page.locator("#marks text").all_text_contents() == ["none", "3"]
+    held[0].continue_()
+    until(lambda: page.locator("#where").text_content().startswith(f"{frame + 2} of "))
+    assert page.locator("#marks circle").count() == 0
     for width in (390, 1280):
         page.set_viewport_size({"width": width, "height": 900})
         assert page.evaluate("document.documentElement.scrollWidth") <= width

@@ -87,7 +87,9 @@ def test_labels_of_other_frames_designs_or_too_few_are_refused(lane, lane_log, c
     assert "0 of 1 labels met a track of the recogniser; row 1: outside of the image; too few" in refusal(
         first.model_copy(update={"range_m": 9.0})
     )
-    assert "; rows 1, 2: on a track that has other labels too" in refusal(first, first.model_copy(update={"id": None}))
+    assert "; rows 1, 2: contradicts other labels of its track, so left out" in refusal(
+        first, first.model_copy(update={"id": None})
+    )
     assert "label more with `sonar-graph label`" in refusal(first)
 
 
@@ -128,6 +130,26 @@ def test_a_wrong_file_is_named_with_what_was_expected(name, text, said, lane_log
         read_labels(tmp_path / name, lane_log)
     assert str(tmp_path / name) in str(refused.value)
     assert said in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("said", "dropped"),
+    [
+        ([(1, 1), (2, 1), (3, 1)], []),
+        ([(1, 1), (1, 2), (2, 1), (3, 1)], [1, 2]),
+        ([(1, 1), (2, 1), (3, None)], [3]),
+        ([(1, 1), (2, 2)], [1, 2]),
+        ([(1, 1), (1, 2)], [1, 2]),
+    ],
+)
+def test_of_contradicting_labels_of_a_track_only_those_go_that_most_others_contradict(said, dropped):
+    given = [Label(stamp_ns=stamp_ns, range_m=2.0, azimuth_rad=0.0, id=landmark) for stamp_ns, landmark in said]
+    track = LabelledTrack(labels=list(enumerate(given, 1)), labelled=[np.full(3, row) for row in range(len(given))])
+    assert track.drop_contradictions() == dropped
+    kept = [row for row in range(1, len(given) + 1) if row not in dropped]
+    assert [row for row, _ in track.labels] == kept
+    assert [place[0] + 1 for place in track.labelled] == kept
+    assert len(track.ids) == bool(kept)
 
 
 @pytest.mark.parametrize(("bias_m", "least", "most"), [(0.0, 0.0, 0.35), (0.05, 0.9, 1.0)])

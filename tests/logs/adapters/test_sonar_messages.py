@@ -13,7 +13,7 @@ from sonar_graph.logs.adapters.log_config import read_log_config
 from sonar_graph.logs.cdr import definition, encode, parse_definition
 from sonar_graph.logs.inspection import inspect_log
 from sonar_graph.logs.mcap import Keep, Topic
-from sonar_graph.logs.reading import read_sonar_frames
+from sonar_graph.logs.sonar_images import read_sonar_frames
 from sonar_graph.measurements import Floats
 
 from .conftest import STEP_NS, T0_NS, Entry, dvl, imu, rows_of, vector

@@ -17,7 +17,7 @@ from sonar_graph.logs.convert.sonar_file import SonarConversion
 from sonar_graph.logs.mcap.reader import Recording
 from sonar_graph.logs.mcap.scanning import scan
 from sonar_graph.logs.mcap.topic import Keep
-from sonar_graph.logs.reading import read_sonar_frames
+from sonar_graph.logs.sonar_images import read_sonar_frames
 from sonar_graph.logs.vehicle_setup import read_calibration, read_notes
 
 START = datetime(2014, 5, 6, 7, 8, 9, 250_000, tzinfo=UTC)

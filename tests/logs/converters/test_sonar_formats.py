@@ -7,7 +7,7 @@ import pytest
 
 from sonar_graph.errors import DatasetError
 from sonar_graph.images import decibels
-from sonar_graph.logs.reading import read_sonar_frames
+from sonar_graph.logs.sonar_images import read_sonar_frames
 
 from .sonar_recordings import CONVERTERS, START_NS, STEP_NS, Aris, Ddf, Oculus, converted, images, log_of, no_ping, put
 
