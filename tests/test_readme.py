@@ -85,7 +85,7 @@ def test_commands_are_understood(page: str, tmp_path: Path, monkeypatch: pytest.
 
     text = (ROOT / page).read_text(encoding="utf-8")
     monkeypatch.chdir(tmp_path)
-    for name in re.findall(r"[\w./]+\.(?:mcap|toml|aris|raw|bag|json)\b", text):
+    for name in re.findall(r"[\w./]+\.(?:mcap|toml|aris|raw|bag|json|csv)\b", text):
         if not Path(name).is_absolute():
             Path(name).parent.mkdir(parents=True, exist_ok=True)
             Path(name).touch()
