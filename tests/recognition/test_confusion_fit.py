@@ -130,8 +130,8 @@ STRANGERS = tuple(replace(d, id=d.id + 6) for d in DEFAULT_DESIGNS[:2])
 @pytest.mark.parametrize(
     ("changes", "designs", "words"),
     [
-        ({"truth": None}, None, r"lane\.mcap: without true poses and true landmarks"),
-        ({"true_landmarks": None}, None, r"lane\.mcap: without true poses and true landmarks"),
+        ({"truth": None}, None, r"lane\.mcap: has no true poses and true landmarks"),
+        ({"true_landmarks": None}, None, r"lane\.mcap: has no true poses and true landmarks"),
         ({}, STRANGERS, r"lane\.mcap: its true landmarks are 1, 2, 3, 4, the designs are 7, 8: "),
         ({}, (DEFAULT_DESIGNS[0], STRANGERS[1]), r"landmark 8: 0"),
         ({"truth": "late"}, None, "landmark 1: "),  # frames outside the truth are not labelled
