@@ -1,3 +1,3 @@
 """Version of the package: released, kept with every comparison, and part of a run's key."""
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
