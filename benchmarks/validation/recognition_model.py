@@ -29,7 +29,7 @@ import numpy as np
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from common import conclude, in_parallel, make_parser, print_table
 
-from sonar_graph.devices import DEFAULT_DESIGNS
+from sonar_graph.devices import DEFAULT_DESIGNS, LandmarkDesign, load_designs
 from sonar_graph.recognition.confusion_fit import (
     LabelledFits,
     LabelledSightings,
@@ -46,6 +46,8 @@ from sonar_graph.sonar import SHIPPED, IdentityParams, Recogniser, read_confusio
 from sonar_graph.sonar.bayes import bounded_evidence
 
 RANDOM, WINDOWS_M, MILD = (*range(3001, 3041), *range(3210, 3219)), {3121: 8.0, 3122: 9.5, 3123: 5.0}, range(3201, 3210)
+OTHERS = {seed: ("bare_landmarks.toml", "mixed_landmarks.toml")[seed // 2 % 2] for seed in range(3301, 3317)}
+"""Basins of other designs."""
 ACCURACY = (1002, 1004)
 FOAM_M, SAME_HEIGHT_M = 0.012, 0.003
 IDS = tuple(design.id for design in DEFAULT_DESIGNS)
@@ -75,7 +77,7 @@ def conditions_of(seed: int) -> dict[str, Any]:
         "attitude_error_deg": rng.uniform(0.0, 0.7),
         "altitude_error_m": rng.uniform(0.0, 0.02),
     }
-    if seed in RANDOM:
+    if seed in RANDOM or seed in OTHERS:
         return {name: float(value) for name, value in drawn.items()}
     if seed in WINDOWS_M:
         return {"window_m": WINDOWS_M[seed], "contrast_db": float(drawn["contrast_db"])}
@@ -88,17 +90,24 @@ def is_as_designed(conditions: dict[str, Any]) -> bool:
     return abs(conditions.get("foam_height_m", FOAM_M) - FOAM_M) <= SAME_HEIGHT_M
 
 
+def designs_of(seed: int) -> tuple[LandmarkDesign, ...]:
+    """Designs of the landmarks in the basin of a seed."""
+    return load_designs(Path(__file__).with_name(OTHERS[seed])) if seed in OTHERS else DEFAULT_DESIGNS
+
+
 def sightings_of(seed: int) -> LabelledSightings:
     """What the recogniser sees in the basin of a seed, labelled by the truth."""
     known = conditions_of(seed)
     if known:
         rate_hz = 1.5 if "window_m" in known else 3.0
+        if seed in OTHERS:
+            known["designs"] = str(Path(__file__).with_name(OTHERS[seed]))
         image = ImageOptions.model_validate({"strangers": ["natural", "look-alikes"]} | known)
         options = BasinOptions(duration_s=200.0, laps=1, seed=seed, frame_rate_hz=rate_hz, image=image)
     else:
         options = BasinOptions(duration_s=390.0, seed=seed, frame_rate_hz=5.0, image=ImageOptions())
     sequence, found = simulate_basin(options), LabelledSightings(IDS)
-    recogniser = Recogniser(sequence.calibration)
+    recogniser = Recogniser(sequence.calibration, designs_of(seed))
     session = RecognitionSession(sequence, recogniser=recogniser, pictures=False)
     for block in simulate_basin_frames(options):
         truth, is_landmark = block.truth, block.truth.ids > 0

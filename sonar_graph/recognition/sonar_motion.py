@@ -102,7 +102,8 @@ class SonarMotions:
         self._odometry.add(sequence.imu, sequence.dvl)
         self._tilt = _Tilt(sequence, self._odometry)
         self._height = _Height(sequence.depth, sequence)
-        self._floor = calibration.floor if sequence.depth is not None else None
+        self._floor = calibration.floor
+        self._has_depth = sequence.depth is not None
         self._body_T_sonar = calibration.sonar.mounting.pose()
         self._start_ns, self._end_ns = sequence.start_ns, sequence.end_ns
         self._stamp_ns = sequence.start_ns
@@ -115,6 +116,7 @@ class SonarMotions:
             self._end_ns = max(self._end_ns, int(imu.stamps_ns[-1]))
         if depth is not None:
             self._height.add(depth)
+            self._has_depth = True
         settled_ns = min(self._stamp_ns, self._tilt.epoch_ns)
         if settled_ns > self._start_ns + KEPT_NS:
             self._odometry.forget_before(settled_ns - KEPT_NS)
@@ -145,7 +147,7 @@ class SonarMotions:
             previous_T_sonar = sonar_T_body.compose(motion.i_T_j).compose(self._body_T_sonar)
             step = SonarStep(previous_T_sonar, adjoint @ motion.covariance @ adjoint.T)
         self._stamp_ns, self._is_first = stamp_ns, False
-        if self._floor is not None:
+        if self._floor is not None and self._has_depth:
             height_m = float(self._height.z_m + up @ self._body_T_sonar.translation() - self._floor.z_m)
             if height_m > 0:
                 level_R_sonar = level_from_up(self._body_T_sonar.rotation().matrix().T @ up)

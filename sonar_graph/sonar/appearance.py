@@ -23,9 +23,18 @@ from sonar_graph.numerics import compiled
 from sonar_graph.sonar.confusion import Confusion
 from sonar_graph.sonar.evidence import Figures
 from sonar_graph.sonar.geometry import FloorView
-from sonar_graph.sonar.place import Relief
+from sonar_graph.sonar.place import LONGEST_SHADOW, SHADE_FINE, Relief
 from sonar_graph.sonar.regions import Candidates
-from sonar_graph.sonar.templates import ASSUMED_SLOPE, BLUR_RATIO, Blur, Floats32, Patch, PolarGrid, Templates
+from sonar_graph.sonar.templates import (
+    ASSUMED_SLOPE,
+    BLUR_RATIO,
+    FINE,
+    Blur,
+    Floats32,
+    Patch,
+    PolarGrid,
+    Templates,
+)
 
 COARSE = 2
 """Cells between the places from which the search climbs to the best one."""
@@ -94,7 +103,7 @@ class Appearance:
         self._rim = (self.patch_side - templates.side) // 2 - self._steps
         self._designs, self._blur_m = tuple(designs), blur_m
         self._compared = x, y = np.divmod(templates.cells, templates.side)
-        self._reliefs: dict[int, Relief] = {}
+        self._reliefs: dict[tuple[int, int], Relief] = {}
         pictures = templates.pictures
         self._search = Search(
             (x + self._rim) * self.patch_side + y + self._rim,
@@ -122,21 +131,21 @@ class Appearance:
     def place(self, patch: Patch, fit: DesignFit, design: int, grazing_slope: float) -> tuple[Floats, Floats]:
         """Place of a design in a patch that it fits, and the bound of its standard deviations (x, y on the floor, m).
 
-        ``grazing_slope`` is the height of the sonar over the distance along the floor.
+        ``grazing_slope`` is the height of the sonar over the distance along the floor. Only so many cells count for the
+        bound as are independent.
         """
-        cell_m, row = self.params.cell_m, int(fit.template[design])
-        if row not in self._reliefs:
-            heading_rad = float(self.templates.heading_rad[row])
-            self._reliefs[row] = Relief.of(
-                self._designs[design], heading_rad, self.templates.side, cell_m, self._blur_m
-            )
-        relief_m, origin = self._designs[design].standing_m, self._rim + self._steps
+        cell_m, relief_m, origin = self.params.cell_m, self._designs[design].standing_m, self._rim + self._steps
+        shadow_m = relief_m * (grazing_slope + 1 / grazing_slope)
+        shade = min(shadow_m / cell_m * FINE / SHADE_FINE, LONGEST_SHADOW)
+        drawn = row, steps = int(fit.template[design]), int(shade)
+        if drawn not in self._reliefs:
+            heading_rad, side = float(self.templates.heading_rad[row]), self.templates.side
+            self._reliefs[drawn] = Relief.of(self._designs[design], heading_rad, side, cell_m, self._blur_m, steps)
         start = (fit.centre_m[design] - patch.centre_m) / cell_m + origin
-        side_m, shadow_m = relief_m * grazing_slope, relief_m * (grazing_slope + 1 / grazing_slope)
-        place, bound = self._reliefs[row].place(
-            patch.level_db, patch.seen, self._compared, start, side_m, shadow_m / cell_m
+        place, bound = self._reliefs[drawn].place(
+            patch.level_db, patch.seen, self._compared, start, relief_m * grazing_slope, shade - steps
         )
-        return patch.centre_m + cell_m * (place - origin), cell_m * bound
+        return patch.centre_m + cell_m * (place - origin), cell_m / math.sqrt(self.figures.independent) * bound
 
 
 def numbered_places(side: int) -> Ints:

@@ -31,7 +31,7 @@ from sonar_graph.measurements import Floats, Ints
 from sonar_graph.numerics import compiled
 from sonar_graph.sonar.templates import Blur, Floats32, Patch, Templates, drawn, material_radius_m
 
-Bools = NDArray[np.bool_]
+Bools, Bytes = NDArray[np.bool_], NDArray[np.uint8]
 EVIDENCE = ("prior", "outline", "figure", "contrast", "beyond", "floor", "behind", "plate", "bare", "rival", "covered")
 """prior: 1; outline: ln R(otherwise) / R(design); figure: the same without S and D; contrast: ln beta / sigma; beyond:
 ln mean square of what is brighter than the design says, next to the figure; floor: ln mean square of what is darker,
@@ -39,8 +39,9 @@ farther out; behind: level next to the figure on its far side, dB; plate: root o
 R(without B) / R(design) where that is less, since a plate alone is none; bare: 1 for a design without dark parts, which
 no plate can speak for; rival: ln of the least R(covered) of all designs over that of this one, as shares of what one
 level leaves; covered: ln R(design without S) / R(covered)."""
-RATIOS = [EVIDENCE.index(name) for name in ("outline", "figure", "rival", "covered")]
-"""Columns that are logarithms of ratios of two R, and so count by the number of independent cells."""
+POWER_OF_CELLS = np.array([1.0 if name in ("outline", "figure", "rival", "covered") else 0.0 for name in EVIDENCE])
+POWER_OF_CELLS[EVIDENCE.index("plate")] = 0.5
+"""Power of the share of independent cells by which columns count: logarithms of ratios of two R, and the root of one."""
 HALF_POWER = 2 * math.sqrt(2 * math.log(2))
 """Width at half of the power over the standard deviation."""
 STRETCHES = (
@@ -62,6 +63,8 @@ LEAST_BETA_DB, LEAST_DB2 = 0.5, 0.3
 """Floors of logarithms."""
 LEAST_VARIANCE_DB2 = 0.1
 """Variance of a patch up to which it shows no speckle and nothing else: 5.57 dB squared over 300 looks."""
+STEP = np.float32(1 / 64)
+"""In which models are kept, as bytes: a fit reads thousands of cells, and memory is what it waits for."""
 OUT, PART = 0.12, 0.5
 """Shares of a cell in a figure: up to the first it lies outside, from the second on inside."""
 NEAR, BEHIND, FAR = 1, 2, 4
@@ -78,24 +81,26 @@ class Figures(NamedTuple):
     """Cells along the side of the patches, in which the models may be shifted."""
     first: Ints
     """First row of each template, and n, shape (templates + 1,)."""
-    cells: Ints
+    cells: NDArray[np.int32]
     """Cells of a patch, row by row, with the template at its first place, shape (n,)."""
-    values: Floats32
-    """1, D, the figures B_q, and S_q behind them, shape (n, 2 + 2 figures)."""
+    values: Bytes
+    """1, D, the figures B_q, and S_q behind them, in `STEP`, shape (n, 2 + 2 figures)."""
     smooth: Floats32
     """D and B over 3 by 3 cells, shape (n, 2)."""
-    zones: Ints
+    zones: Bytes
     """Sums of `FAR`, `NEAR` and `BEHIND`, shape (n,)."""
     gram: Floats
     """``values^T values`` of each template, shape (templates, 2 + 2 figures, 2 + 2 figures)."""
     has_dark: Bools
     """Whether it has dark parts, shape (templates,)."""
-    strips: NDArray[np.uint8]
+    strips: Bytes
     """Number of edges of each direction that a cell lies beyond, shape (n, EDGES)."""
     kept: Floats
     """`kept_sums` of each template, shape (templates, EDGES, offsets, 3)."""
     independent: float
     """Share of the cells that are independent: cells are not where the sonar resolves less."""
+    counts: Floats
+    """By how much each column of `EVIDENCE` counts, shape (11,)."""
 
     @classmethod
     def of(cls, designs: Sequence[LandmarkDesign], templates: Templates, blur_m: Blur, last: int) -> Figures:
@@ -123,13 +128,15 @@ class Figures(NamedTuple):
             zones = NEAR * (is_out & is_near) + BEHIND * (is_out & (behind(figure, BEHIND_CELLS) > PART))
             zones += FAR * (is_out & ~is_near & (dark < OUT))
             shades = [behind(one, SHADOW_CELLS) for one in figures]
-            values = np.stack([np.ones_like(figure), dark, *figures, *shades])[:, compared].T.astype(np.float32)
+            exact = np.stack([np.ones_like(figure), dark, *figures, *shades])[:, compared].T
+            values = np.clip(np.rint(exact / STEP), 0, 255).astype(np.uint8)
             smooth = np.stack([cv2.blur(dark, (3, 3)), cv2.blur(figure, (3, 3))])[:, compared].T.astype(np.float32)
-            gram = values.T.astype(float) @ values
+            kept, in_steps = np.empty((EDGES, len(OFFSETS), 3)), values.astype(float)
+            gram = float(STEP) ** 2 * (in_steps.T @ in_steps)
             x, y = np.nonzero(compared)
             strips = (beyond_m[compared] > radius_m(figure, away_m) * np.array(OFFSETS)[:, None, None]).sum(axis=0)
-            own = x * (side + last) + y, values, smooth, zones[compared], strips.astype(np.uint8)
-            kept = np.empty((EDGES, len(OFFSETS), 3))
+            at = (x * (side + last) + y).astype(np.int32)
+            own = at, values, smooth, zones[compared].astype(np.uint8), strips.astype(np.uint8)
             kept_sums(values, np.ones(len(values), np.float32), own[-1], kept)
             columns.append((*own, gram, has_dark, kept))
         *rows, grams, darks, sums = zip(*columns, strict=True)
@@ -137,7 +144,8 @@ class Figures(NamedTuple):
         cells, values, smooth, zones, strips = (np.ascontiguousarray(np.concatenate(of)) for of in rows)
         independent = math.prod(min(cell_m / (HALF_POWER * blur), 1.0) for blur in blur_m)
         of_templates = np.array(grams), np.array(darks), strips, np.array(sums)
-        return cls(side + last, first, cells, values, smooth, zones, *of_templates, independent)
+        counts = independent**POWER_OF_CELLS
+        return cls(side + last, first, cells, values, smooth, zones, *of_templates, independent, counts)
 
     def evidence(self, patch: Patch, template: Ints, cell: Ints) -> Floats | None:
         """`EVIDENCE` of templates on the parts of a patch that begin at some cells, shapes (n,), (n, 2), (n, 11).
@@ -148,18 +156,17 @@ class Figures(NamedTuple):
         is_measured = fill_evidence(
             patch.level_db.ravel(), patch.seen.ravel(), patch.smooth_db.ravel(), patch.held.ravel(), self.patch_side,
             self.first, self.cells, self.values, self.smooth, self.zones, self.gram, self.has_dark, self.strips,
-            self.kept,             template, cell, found,
+            self.kept, self.counts, template, cell, found,
         )  # fmt: skip
-        found[:, RATIOS] *= self.independent
-        found[:, EVIDENCE.index("plate")] *= math.sqrt(self.independent)
         return found if is_measured else None
 
 
 @compiled
 def fill_evidence(
     level_db: Floats32, seen: Floats32, smooth_db: Floats32, held: Floats32, side: int,
-    first_of: Ints, all_cells: Ints, all_values: Floats32, all_smooth: Floats32, all_zones: Ints, grams: Floats,
-    has_dark: Bools, all_strips: NDArray[np.uint8], all_kept: Floats, template: Ints, cell: Ints, found: Floats,
+    first_of: Ints, all_cells: NDArray[np.int32], all_values: Bytes, all_smooth: Floats32, all_zones: Bytes,
+    grams: Floats, has_dark: Bools, all_strips: Bytes, all_kept: Floats, counts: Floats, template: Ints, cell: Ints,
+    found: Floats,
 ) -> bool:  # fmt: skip
     """Fill in `EVIDENCE` of templates on the parts of a patch that begin at some cells, shape (n, 11).
 
@@ -171,25 +178,25 @@ def fill_evidence(
         begin, end, shift = first_of[template[k]], first_of[template[k] + 1], cell[k, 0] * side + cell[k, 1]
         cells, values, rows = all_cells[begin:end], all_values[begin:end], end - begin
         smooth, zones = all_smooth[begin:end], all_zones[begin:end]
-        level, is_seen = np.empty((1, rows), np.float32), np.empty(rows, np.float32)
+        level, is_seen = np.empty(rows, np.float32), np.empty(rows, np.float32)
         for n in range(rows):
-            level[0, n], is_seen[n] = level_db[cells[n] + shift], seen[cells[n] + shift]
+            level[n], is_seen[n] = level_db[cells[n] + shift], seen[cells[n] + shift]
         count = float(np.dot(is_seen, is_seen))
         if count < LEAST_CELLS:
             return False
-        mean = np.float32(np.dot(level[0], is_seen) / count)
+        mean = np.float32(np.dot(level, is_seen) / count)
         for n in range(rows):
-            level[0, n] = (level[0, n] - mean) * is_seen[n]
-        total = float(np.dot(level[0], level[0]))
+            level[n] = (level[n] - mean) * is_seen[n]
+        total = float(np.dot(level, level))
         if total < LEAST_VARIANCE_DB2 * count:
             return False
         # products of the columns with each other and with the levels
-        gram, products = grams[template[k]].copy(), np.dot(level, values)[0]
-        for n in range(rows):
+        gram, products = grams[template[k]].copy(), products_of(level, values)
+        for n in range(rows if count < rows else 0):
             if is_seen[n] == 0:
                 for i in range(len(gram)):
                     for j in range(len(gram)):
-                        gram[i, j] -= values[n, i] * values[n, j]
+                        gram[i, j] -= (STEP * values[n, i]) * (STEP * values[n, j])
         c, dark, first, kinds = np.zeros(4), 1, 2, (len(products) - 2) // 2
         # the design: with its dark parts where they are dark, with and without a shadow
         plain, _ = least_squares(gram, products, total, np.array([0, first]), c)
@@ -225,7 +232,7 @@ def fill_evidence(
             if zones[n] & FAR:
                 far, far_cells = far + min(off, 0.0) ** 2, far_cells + 1
             if zones[n] & BEHIND and is_seen[n] > 0:
-                back, back_cells = back + level[0, n] - floor, back_cells + 1
+                back, back_cells = back + level[n] - floor, back_cells + 1
         found[k, 0] = 1.0
         found[k, 1] = math.log(other / both)
         found[k, 2] = math.log(other_plain / plain)
@@ -240,32 +247,48 @@ def fill_evidence(
         if count < rows:
             kept = np.empty(kept.shape)
             kept_sums(values, is_seen, strips, kept)
-        covered = least_covered(level[0], values, strips, kept, count, gram, only_dark, dz, delta < 0)
+        covered = least_covered(level, values, strips, kept, count, gram, only_dark, dz, delta < 0)
         covered = min(covered, design if beta > 0 else only_dark)
         found[k, 9], found[k, 10] = math.log(covered / total), math.log(max(design / covered, 1.0))
         least = min(least, found[k, 9])
     for k in range(len(template)):
         found[k, 9] = least - found[k, 9]
+        found[k] *= counts
     return True
 
 
 @compiled
-def kept_sums(values: Floats32, seen: Floats32, strips: NDArray[np.uint8], kept: Floats) -> None:
+def products_of(level: Floats32, values: Bytes) -> Floats32:
+    """``values^T level``, values in `STEP`. Four cells at a time: a sum that waits for each takes twice as long."""
+    found, last = np.zeros(values.shape[1], np.float32), len(level) // 4 * 4
+    for n in range(0, last, 4):
+        a, b, c, d = level[n], level[n + 1], level[n + 2], level[n + 3]
+        for i in range(len(found)):
+            found[i] += a * np.float32(values[n, i]) + b * np.float32(values[n + 1, i])
+            found[i] += c * np.float32(values[n + 2, i]) + d * np.float32(values[n + 3, i])
+    for n in range(last, len(level)):
+        for i in range(len(found)):
+            found[i] += level[n] * np.float32(values[n, i])
+    return found * STEP
+
+
+@compiled
+def kept_sums(values: Bytes, seen: Floats32, strips: Bytes, kept: Floats) -> None:
     """Fill in sums of b, b^2 and b D over the cells of a figure up to each edge, shape (EDGES, offsets, 3)."""
     kept[:] = 0.0
     for n in range(len(values)):
-        b = values[n, 2] * seen[n]
+        b = STEP * values[n, 2] * seen[n]
         if b > OUT:
             for e in range(strips.shape[1]):
                 for strip in range(strips[n, e], kept.shape[1]):
                     kept[e, strip, 0] += b
                     kept[e, strip, 1] += b * b
-                    kept[e, strip, 2] += b * values[n, 1]
+                    kept[e, strip, 2] += b * (STEP * values[n, 1])
 
 
 @compiled
 def least_covered(
-    level: Floats32, values: Floats32, strips: NDArray[np.uint8], kept: Floats, count: float, gram: Floats,
+    level: Floats32, values: Bytes, strips: Bytes, kept: Floats, count: float, gram: Floats,
     only_dark: float, dz: float, has_dark: bool,
 ) -> float:  # fmt: skip
     """Least sum of squares that a figure leaves of which all beyond a straight edge is covered, with D or without.
@@ -276,8 +299,9 @@ def least_covered(
     edges, offsets, _ = kept.shape
     products = np.zeros((offsets + 1, edges), np.float32)
     for n in range(len(level)):
-        if values[n, 2] > OUT:
-            bz = values[n, 2] * level[n]
+        b_n = STEP * values[n, 2]
+        if b_n > OUT:
+            bz = b_n * level[n]
             for e in range(edges):
                 products[strips[n, e], e] += bz
     dark_mean, dd, least = gram[0, 1] / count, gram[1, 1] - gram[0, 1] ** 2 / count, only_dark

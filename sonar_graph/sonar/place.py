@@ -25,15 +25,15 @@ from sonar_graph.sonar.templates import FINE, Blur, Floats32, echo_power, seen_d
 
 SIDE_M = 0.006
 """Width of the side for which it is drawn, to a fine point."""
-SHADES, SHADE_FINE = 12, FINE // 2
-"""Shadows that are drawn: number, and by how many points of the fine grid each is longer than the one before."""
+SHADE_FINE, LONGEST_SHADOW = FINE // 2, 12
+"""Step of the lengths of shadows that are drawn, in points of the fine grid, and the longest one in such steps."""
 STEPS = 2
 """Gauss-Newton steps from the best cell on."""
 LEAST_BETA_DB, LEAST_CELLS = 0.05, 20
 
 
 class Relief(NamedTuple):
-    """A design at one heading and what its height adds, on the grid of the templates, shapes (side, side)."""
+    """A design at one heading, and what its height adds, on the grid of the templates, shapes (side, side)."""
 
     figure: Floats32
     """B, dB."""
@@ -41,28 +41,30 @@ class Relief(NamedTuple):
     """W, dB for each metre of the face that the side covers."""
     dark: Floats32
     """D, dB."""
-    shades: Floats32
-    """Shares of the cells in the shadows, of length 0 first, shape (SHADES + 1, side, side)."""
+    shades: tuple[Floats32, Floats32]
+    """Shares of the cells in a shadow of so many steps, and of one more."""
 
     @classmethod
-    def of(cls, design: LandmarkDesign, heading_rad: float, side: int, cell_m: float, blur_m: Blur) -> Relief:
+    def of(
+        cls, design: LandmarkDesign, heading_rad: float, side: int, cell_m: float, blur_m: Blur, shade_steps: int
+    ) -> Relief:
         """A design at this heading against the direction away from the sonar, which is the grid's x axis."""
         of_bright, power = echo_power(design, heading_rad, side, cell_m)
         is_bright = power > 1
         width = round(SIDE_M / cell_m * FINE)
         shaded, raised_power = is_bright.copy(), with_side(power, width)
         bright, whole, raised = (seen_db(one, cell_m, blur_m) for one in (of_bright, power, raised_power))
-        shades = [np.zeros_like(bright)]
-        for _ in range(SHADES):
-            for _ in range(SHADE_FINE):
-                shaded[1:] |= shaded[:-1]
-            shades.append(seen_share(shaded & ~is_bright, cell_m, blur_m))
-        return cls(bright, (raised - whole) / (width * cell_m / FINE), whole - bright, np.stack(shades))
+        for _ in range(shade_steps * SHADE_FINE):
+            shaded[1:] |= shaded[:-1]
+        shorter = seen_share(shaded & ~is_bright, cell_m, blur_m)
+        for _ in range(SHADE_FINE):
+            shaded[1:] |= shaded[:-1]
+        shades = shorter, seen_share(shaded & ~is_bright, cell_m, blur_m)
+        return cls(bright, (raised - whole) / (width * cell_m / FINE), whole - bright, shades)
 
     def place(
-        self, level_db: Floats32, seen: Floats32, cells: tuple[Ints, Ints], start: Floats, side_m: float,
-        shadow_cells: float,
-    ) -> tuple[Floats, Floats]:  # fmt: skip
+        self, level_db: Floats32, seen: Floats32, cells: tuple[Ints, Ints], start: Floats, side_m: float, longer: float
+    ) -> tuple[Floats, Floats]:
         """Place of the first cell of the figure's square in a patch, and the bound of its standard deviation, in cells.
 
         Parameters
@@ -73,30 +75,32 @@ class Relief(NamedTuple):
             Rows and columns of the square that are compared.
         start
             Place at which to begin, shape (2,).
-        side_m, shadow_cells
-            Width of the face that the side covers, and length of the shadow.
+        side_m
+            Width of the face that the side covers.
+        longer
+            Share of a step by which the shadow is longer than the first of `shades`.
         """
         place, bound = start.astype(float), np.full(2, np.inf)
-        at = min(shadow_cells * FINE / SHADE_FINE, SHADES - 1e-9)
-        k = int(at)
-        shade = self.shades[k] + np.float32(at - k) * (self.shades[k + 1] - self.shades[k])
         fit_place(
-            level_db, seen, *cells, self.figure + np.float32(side_m) * self.side, self.dark * (1 - shade), shade,
-            place, bound,
+            level_db, seen, *cells, self.figure, self.side, self.dark, *self.shades, side_m, longer, place, bound
         )  # fmt: skip
         return place, bound
 
 
 @compiled
 def fit_place(
-    level_db: Floats32, seen: Floats32, rows: Ints, columns: Ints, figure: Floats32, dark: Floats32, shade: Floats32,
-    place: Floats, bound: Floats,
+    level_db: Floats32, seen: Floats32, rows: Ints, columns: Ints, face: Floats32, side_of: Floats32, plate: Floats32,
+    shorter: Floats32, longest: Floats32, side_m: float, longer: float, place: Floats, bound: Floats,
 ) -> None:  # fmt: skip
     """Move a place to the least squares, and fill in the Cramer-Rao bound of its standard deviations, in cells.
+
+    Parts of the landmark, and their shadows, are those of `Relief`.
 
     ``M = [1, B, D, S, dz/dx, dz/dy]`` with ``dz/dp = -(beta grad B + delta grad D + gamma grad S)``; the bound is the
     root of the last two on the diagonal of ``s^2 (M^T M)^-1``, s^2 the mean square of what is left.
     """
+    shade = shorter + np.float32(longer) * (longest - shorter)
+    figure, dark = face + np.float32(side_m) * side_of, plate * (1 - shade)
     beta, delta, gamma = np.float32(0), np.float32(0), np.float32(0)
     side, last, count = len(figure), len(level_db) - 1, np.float32(0)
     mean = np.float32(np.sum(level_db * seen) / max(np.sum(seen), 1.0))

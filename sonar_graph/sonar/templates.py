@@ -160,7 +160,7 @@ def blurred(fine: Floats32, cell_m: float, blur_m: Blur) -> Floats32:
 def of_cells(fine: Floats32) -> Floats32:
     """Means of the fine points of each cell."""
     side = len(fine) // FINE
-    return np.asarray(fine.reshape(side, FINE, side, FINE).mean(axis=(1, 3)), np.float32)
+    return np.asarray(cv2.resize(fine, (side, side), interpolation=cv2.INTER_AREA), np.float32)
 
 
 def material_radius_m(design: LandmarkDesign) -> float:

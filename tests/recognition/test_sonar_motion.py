@@ -247,6 +247,18 @@ def test_without_a_floor_below_or_depth_there_is_no_view(exact):
         assert along(run, frames_of(run, 1))[1] == [None]
 
 
+def test_depth_that_begins_after_the_images_gives_the_view_from_then_on(exact):
+    """As it comes in a live run: the first frame has none, the next those of a log with all of the depth."""
+    stamps_ns, motions = frames_of(exact, 3), SonarMotions(replace(exact, depth=None))
+    views = [motions.at(stamps_ns[0])[1]]
+    motions.extend(None, None, exact.depth.between(stamps_ns[0], exact.end_ns))
+    views += [motions.at(stamp_ns)[1] for stamp_ns in stamps_ns[1:]]
+    assert views[0] is None
+    for found, whole in zip(views[1:], along(exact, stamps_ns)[1][1:], strict=True):
+        assert found.height_m == pytest.approx(whole.height_m, abs=0.01)
+        np.testing.assert_allclose(found.level_R_sonar, whole.level_R_sonar, atol=1e-9)
+
+
 def test_only_instants_with_odometry_and_in_order_are_covered(exact):
     motions, stamps_ns = SonarMotions(exact), frames_of(exact, 3)
     ends_ns = [exact.start_ns - 1, exact.start_ns, exact.end_ns, exact.end_ns + 1]

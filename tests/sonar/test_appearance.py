@@ -15,7 +15,7 @@ from sonar_graph.sonar.appearance import (
     DesignFit,
 )
 from sonar_graph.sonar.confusion import Confusion, confusion_for
-from sonar_graph.sonar.evidence import BEHIND, EVIDENCE, FAR, NEAR, STRETCHES, Figures
+from sonar_graph.sonar.evidence import BEHIND, EVIDENCE, FAR, NEAR, STEP, STRETCHES, Figures
 from sonar_graph.sonar.geometry import FloorView
 from sonar_graph.sonar.templates import (
     Patch,
@@ -246,7 +246,7 @@ def plain_evidence(figures: Figures, template: int, x: int, y: int, patch: Patch
     seen, held = patch.seen[i, j] > 0, patch.held[i, j] > 0.5
     level = patch.level_db[i, j] - patch.level_db[i, j][seen].mean()
     smooth = patch.smooth_db[i, j] - patch.level_db[i, j][seen].mean()
-    values, zones, design = figures.values[rows].astype(float), figures.zones[rows], figures.smooth[rows]
+    values, zones, design = figures.values[rows] * float(STEP), figures.zones[rows], figures.smooth[rows]
 
     def fitted(*columns: int) -> tuple[float, Floats]:
         A, z = values[seen][:, columns], level[seen].astype(float)
@@ -333,7 +333,8 @@ def test_evidence_is_that_of_least_squares_over_the_cells_in_view(rim: int, blur
 @pytest.mark.parametrize("design", DEFAULT_DESIGNS, ids=lambda design: design.name)
 def test_no_shadow_lies_on_the_face_of_foam_however_bright_its_near_side_is(design):
     figures = Appearance([replace(design, height_m=0.06, relief_m=0.06)], BLUR_M).figures
-    figure, shadow = figures.values[:, 2], figures.values[:, 2 + len(STRETCHES)]
+    values = figures.values * STEP
+    figure, shadow = values[:, 2], values[:, 2 + len(STRETCHES)]
     assert shadow[figure > 0.95].max() <= 0.06
     assert shadow.max() > 0.9
 

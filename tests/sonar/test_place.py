@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.interpolate import RegularGridInterpolator
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -11,24 +12,24 @@ from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.images import SonarFrames
 from sonar_graph.measurements import Floats
 from sonar_graph.simulation.sonar_image import FrameSimulator, ImageOptions, place_landmark
-from sonar_graph.sonar.appearance import AppearanceParams, CandidateFit
+from sonar_graph.sonar.appearance import Appearance, AppearanceParams, CandidateFit
 from sonar_graph.sonar.confusion import confusion_for
 from sonar_graph.sonar.geometry import FloorView
 from sonar_graph.sonar.place import Relief
-from sonar_graph.sonar.templates import drawn
+from sonar_graph.sonar.templates import Patch, drawn
 
 from .polar_images import candidates_at
 
 CELL_M, SIDE, BLUR_M = 0.015, 37, (0.008, 0.01)
-SIDE_M, SHADOW_CELLS = 0.007, 1.8
+SIDE_M, SHADE_STEPS, LONGER = 0.007, 3, 0.6
+"""The shadow is 3.6 steps of half a cell long."""
 ROWS_COLUMNS = tuple(np.indices((SIDE, SIDE)).reshape(2, -1))
-RELIEF = Relief.of(DEFAULT_DESIGNS[2], 0.3, SIDE, CELL_M, BLUR_M)
+RELIEF = Relief.of(DEFAULT_DESIGNS[2], 0.3, SIDE, CELL_M, BLUR_M, SHADE_STEPS)
 
 
 def columns(relief: Relief = RELIEF) -> list[Floats]:
     """B with its side, D where no shadow lies on it, and S, written out."""
-    k = SHADOW_CELLS * 2
-    shade = relief.shades[int(k)] * (1 - k % 1) + relief.shades[int(k) + 1] * (k % 1)
+    shade = relief.shades[0] * (1 - LONGER) + relief.shades[1] * LONGER
     return [relief.figure + SIDE_M * relief.side, relief.dark * (1 - shade), shade]
 
 
@@ -42,7 +43,7 @@ def patch_with(levels: tuple[float, float, float, float], at: tuple[int, int], n
 
 def place_in(patch: Floats, start: tuple[float, float], seen: Floats | None = None) -> tuple[Floats, Floats]:
     held = np.ones_like(patch) if seen is None else seen
-    return RELIEF.place(patch, held, ROWS_COLUMNS, np.array(start), SIDE_M, SHADOW_CELLS)
+    return RELIEF.place(patch, held, ROWS_COLUMNS, np.array(start), SIDE_M, LONGER)
 
 
 @pytest.mark.parametrize("off", [(0.0, 0.0), (0.4, -0.3), (-0.45, 0.45)])
@@ -110,10 +111,42 @@ def test_white_noise_moves_a_place_by_its_bound(noise_db: float):
     assert (share < 1.15).all()
 
 
+@pytest.mark.parametrize("blur_m", [(0.008, 0.02), (0.015, 0.05)])
+def test_noise_that_the_sonar_does_not_resolve_moves_a_place_by_its_bound(blur_m: tuple[float, float]):
+    """Noise of as many nodes as the sonar resolves, linear in between; taken as white it would move a place too far."""
+    looks, rng = Appearance(DEFAULT_DESIGNS, blur_m), np.random.default_rng(1)
+    templates, side = looks.templates, looks.patch_side
+    row = int(np.flatnonzero(templates.design == 1)[2])
+    picture, rim = np.zeros((templates.side, templates.side)), (side - templates.side) // 2
+    picture.ravel()[templates.cells] = templates.pictures[row]
+    spacing, found = 2.3548 * np.array(blur_m) / CELL_M, []
+    for _ in range(150):
+        nodes = rng.normal(0, 4, np.ceil(side / spacing).astype(int) + 2)
+        x, y = ((np.arange(side) + rng.uniform(0, cells)) / cells for cells in spacing)
+        level = 40 + RegularGridInterpolator([*map(np.arange, nodes.shape)], nodes)((x[:, None], y))
+        level[rim : rim + templates.side, rim : rim + templates.side] += picture
+        patch = Patch.of(level.astype(np.float32), np.ones((side, side), np.float32), np.zeros(2))
+        fit = replace(looks.fit(patch), template=np.full(4, row), centre_m=np.zeros((4, 2)))
+        found.append(looks.place(patch, fit, 1, 0.577))
+    places, bounds = map(np.array, zip(*found, strict=True))
+    share = np.std(places, axis=0) / np.sqrt(np.mean(bounds**2, axis=0))
+    assert (share > 0.75).all()
+    assert (share < 1.45).all()
+
+
 @pytest.mark.parametrize("floor_db", [-60.0, 0.0, 90.0])
 def test_no_gain_moves_a_place(floor_db: float):
     plain, other = (place_in(patch_with((db, 0.7, 0.5, -9.0), (5, 6), 4.0, 3), (5, 6)) for db in (40.0, floor_db))
     np.testing.assert_allclose(other, plain, atol=2e-3)
+
+
+def test_a_shadow_is_as_long_as_its_steps():
+    """Of foam with a straight far edge: so many half cells behind it are dark, wholly with little blur."""
+    square = LandmarkDesign(1, "square", 0.3, np.full((150, 150), 12.0))
+    for steps in (0, 1, 4, 11):
+        shades = Relief.of(square, 0.0, SIDE, CELL_M, (1e-4, 1e-4), steps).shades
+        lengths = [one[:, SIDE // 2].sum() for one in shades]
+        np.testing.assert_allclose(lengths, [steps / 2, (steps + 1) / 2], atol=0.02)
 
 
 def test_nothing_in_view_has_no_bound_and_does_not_move():
