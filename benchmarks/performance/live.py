@@ -164,6 +164,7 @@ def one(folder, log, duration_s, estimator, rate, kill_at_s=None, is_cut=False):
     ear.session.close()
     counts = json.loads((place / "live.json").read_text())["messages"]
     result["lost"], result["dropped"] = sum(counts["lost"].values()), sum(counts["dropped"].values())
+    result["dropped_for"] = counts["dropped"]
     latencies = {
         "bare": ear.latencies_ms(IMU, IMU),
         "stamp_to_pose": ear.latencies_ms(IMU, ODOMETRY),

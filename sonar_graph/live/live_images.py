@@ -138,7 +138,8 @@ class LiveImages:
             if missed := engine.counts.received[self._topic] - (message.topic == self._topic):
                 engine.counts.dropped[self._topic, TOO_EARLY] += missed
             assert engine.calibration is not None
-            lacks = NO_HEIGHT if engine.calibration.floor is None else "" if "depth" in engine.in_use else f"{NO_DEPTH}, until it comes"
+            lacks = "" if "depth" in engine.in_use else f"{NO_DEPTH}, until it comes"
+            lacks = lacks if engine.calibration.floor is not None else NO_HEIGHT
             if lacks:
                 engine.remarks.append(f"warning: {self._topic}: {lacks}")
 

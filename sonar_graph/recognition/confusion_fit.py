@@ -228,12 +228,10 @@ def estimate_confusion(
         raise CalibrationError(
             f"too few labelled frames ({'; '.join(poor)}; needed {LEAST_FRAMES} of each): give longer or more logs"
         )
-    tracks = np.array([len(np.unique(fits.track[fits.label == k])) for k in range(len(counts))])
-    trials = np.append(np.full(len(ids), tracks[:-1].sum()), tracks[-1])  # landmarks share the weights
     shipped = read_confusion(SHIPPED)
     weights, looks = fit_weights(fits, np.array(shipped.weights), shipped.looks)
     odds = np.pad(fits.evidence @ weights, ((0, 0), (0, 1)))
-    matrix = confusion_rows(soft_scores(odds, looks), fits.label, trials)
+    matrix = confusion_rows(soft_scores(odds, looks), fits.label, trials_of(fits))
     height_bias_m, error = without_height(fits)
     usual, sigmas, power = accuracy(error, fits.bound_m, fits.track, shipped.bound_power)
     spread = sigmas * (fits.bound_m / usual) ** power
@@ -254,8 +252,19 @@ def estimate_confusion(
         report_interval_s=report_interval_s(error / spread, fits.track, fits.stamp_ns, shipped.report_interval_s),
         provenance=provenance
         | {f"frames of {n}": str(c) for n, c in zip(names, counts.tolist(), strict=True)}
-        | {f"tracks of {n}": str(c) for n, c in zip(names, tracks.tolist(), strict=True)},
+        | {f"tracks of {n}": str(c) for n, c in zip(names, tracks_of(fits).tolist(), strict=True)},
     )
+
+
+def tracks_of(fits: LabelledFits) -> Ints:
+    """Number of tracks of each class."""
+    return np.array([len(np.unique(fits.track[fits.label == k])) for k in range(fits.evidence.shape[1] + 1)])
+
+
+def trials_of(fits: LabelledFits) -> Ints:
+    """Number of trials of each class for the confusion matrix: its tracks; landmarks share theirs, as the weights."""
+    tracks = tracks_of(fits)
+    return np.append(np.full(len(tracks) - 1, tracks[:-1].sum()), tracks[-1])
 
 
 def roughness_of_tracks(fits: LabelledFits) -> tuple[float, float]:

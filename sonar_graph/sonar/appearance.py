@@ -321,6 +321,7 @@ class CandidateFit:
         elevation_aperture_rad: float,
     ) -> None:
         self._designs, self._params, self._confusion = tuple(designs), params, confusion
+        self._weights = np.array(confusion.weights)
         self._aperture_rad = elevation_aperture_rad
         self._grid: PolarGrid | None = None
         self._shape: tuple[Floats, Floats] = np.empty(0), np.empty(0)
@@ -352,7 +353,7 @@ class CandidateFit:
         patch = self._grid.patch(image_db, ahead, centre_m, appearance.patch_side, self._params.cell_m)
         if (fit := appearance.fit(patch)) is None:
             return None
-        best = int(np.argmax(self._confusion.log_odds(fit.evidence)))
+        best = int((fit.evidence @ self._weights).argmax())
         slope = ASSUMED_SLOPE if plane is SLANT_PLANE else plane.height_m / away_m
         return Fitted(fit, *appearance.place(patch, fit, best, slope))
 

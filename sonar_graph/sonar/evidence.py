@@ -31,7 +31,8 @@ from sonar_graph.measurements import Floats, Ints
 from sonar_graph.numerics import compiled
 from sonar_graph.sonar.templates import Blur, Floats32, Patch, Templates, drawn, material_radius_m
 
-Bools, Bytes = NDArray[np.bool_], NDArray[np.uint8]
+Bools = NDArray[np.bool_]
+Bytes = NDArray[np.uint8]
 EVIDENCE = ("prior", "outline", "figure", "contrast", "beyond", "floor", "behind", "plate", "bare", "rival", "covered")
 """prior: 1; outline: ln R(otherwise) / R(design); figure: the same without S and D; contrast: ln beta / sigma; beyond:
 ln mean square of what is brighter than the design says, next to the figure; floor: ln mean square of what is darker,
@@ -41,7 +42,7 @@ no plate can speak for; rival: ln of the least R(covered) of all designs over th
 level leaves; covered: ln R(design without S) / R(covered)."""
 POWER_OF_CELLS = np.array([1.0 if name in ("outline", "figure", "rival", "covered") else 0.0 for name in EVIDENCE])
 POWER_OF_CELLS[EVIDENCE.index("plate")] = 0.5
-"""Power of the share of independent cells by which columns count: logarithms of ratios of two R, and the root of one."""
+"""Power of the share of independent cells by which columns count: logarithms of ratios of two R, and a root of one."""
 HALF_POWER = 2 * math.sqrt(2 * math.log(2))
 """Width at half of the power over the standard deviation."""
 STRETCHES = (

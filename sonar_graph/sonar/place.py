@@ -121,11 +121,34 @@ def fit_place(
         count = products[0, 0]
         if count < LEAST_CELLS:
             return
-        G, g = products[:size, :size] + 1e-6 * np.eye(size), products[:size, 6].copy()
-        c = np.linalg.solve(G, g)
+        c, inverse = solved(products, size)
         beta, delta, gamma = np.float32(max(c[1], LEAST_BETA_DB)), np.float32(max(c[2], 0)), np.float32(min(c[3], 0))
         if size == 6:
-            variance, inverse = max(products[6, 6] - np.dot(c, g), 0.0) / count, np.linalg.inv(G)
+            variance = max(products[6, 6] - np.dot(c, products[6, :6]), 0.0) / count
             for a in range(2):
                 place[a] = (x0, y0)[a] + min(max(c[4 + a], -1.0), 1.0)
-                bound[a] = math.sqrt(variance * inverse[4 + a, 4 + a])
+                bound[a] = math.sqrt(variance * inverse[a])
+
+
+@compiled
+def solved(products: Floats, size: int) -> tuple[Floats, tuple[float, float]]:
+    """Solution of ``G c = g`` by elimination, and the last two on the diagonal of the inverse of G.
+
+    G and g are the first ``size`` rows of the products, g their last column.
+    """
+    a, c, second = products.copy(), np.zeros(size), 0.0
+    for i in range(size):
+        a[i, i] += 1e-6
+    for i in range(size - 1):
+        if i == size - 2:
+            second = a[i + 1, i + 1]
+        for k in range(i + 1, size):
+            factor = a[k, i] / a[i, i]
+            for j in range(i, 7):
+                a[k, j] -= factor * a[i, j]
+    for i in range(size - 1, -1, -1):
+        c[i] = a[i, 6]
+        for j in range(i + 1, size):
+            c[i] -= a[i, j] * c[j]
+        c[i] /= a[i, i]
+    return c, (second / (a[size - 2, size - 2] * a[size - 1, size - 1]), 1 / a[size - 1, size - 1])

@@ -258,9 +258,9 @@ class PolarGrid(NamedTuple):
 
     def patch(self, image_db: Floats32, view: FloorView, centre_m: Floats, side: int, cell_m: float) -> Patch:
         """The image on a grid of ``side`` by ``side`` floor points around a centre."""
-        level, seen = np.zeros((2, side, side), np.float32)
-        sample_floor(self, image_db, view.level_R_sonar, view.height_m, centre_m, cell_m, level, seen)
-        return Patch.of(level, seen, centre_m)
+        level, seen, smooth, held = np.zeros((4, side, side), np.float32)
+        sample_floor(self, image_db, view.level_R_sonar, view.height_m, centre_m, cell_m, level, seen, smooth, held)
+        return Patch(level, seen, smooth, held, centre_m)
 
 
 @inlined
@@ -277,11 +277,28 @@ def azimuth(x: float, y: float) -> float:
 
 
 @compiled
+def smooth_levels(level: Floats32, seen: Floats32, smooth: Floats32, held: Floats32) -> None:
+    """Fill in means of the levels seen in 3 by 3 cells, mirrored at the rim, and the shares that are seen."""
+    side = len(level)
+    total, count = np.empty(side + 2, np.float32), np.empty(side + 2, np.float32)
+    for i in range(side):
+        before, after = abs(i - 1), side - 1 - abs(side - 2 - i)
+        for j in range(side):
+            total[j + 1] = level[before, j] + level[i, j] + level[after, j]
+            count[j + 1] = seen[before, j] + seen[i, j] + seen[after, j]
+        total[0], total[-1], count[0], count[-1] = total[2], total[-3], count[2], count[-3]
+        for j in range(side):
+            n = count[j] + count[j + 1] + count[j + 2]
+            held[i, j] = n / np.float32(9)
+            smooth[i, j] = (total[j] + total[j + 1] + total[j + 2]) / max(n, np.float32(0.9))
+
+
+@compiled
 def sample_floor(
     grid: PolarGrid, image_db: Floats32, R: Floats, height_m: float, centre: Floats, cell_m: float,
-    level: Floats32, seen: Floats32,
+    level: Floats32, seen: Floats32, smooth: Floats32, held: Floats32,
 ) -> None:  # fmt: skip
-    """Fill in levels on a square grid of the floor, and 1 where a point is in the image, shapes (side, side).
+    """Fill in levels on a square grid of the floor, 1 where a point is in the image, and both by `smooth_levels`.
 
     Each is the mean of decibels over the bins whose middles a cell covers, or where cells are finer than bins, linear
     between the two nearest; linear between beams. R is ``level_R_sonar``.
@@ -322,20 +339,4 @@ def sample_floor(
                     of_one, of_other = of_one + one[n], of_other + other[n]
                 level[i, j] = (of_one + share * (of_other - of_one)) / (last - first + np.uint32(1))
             seen[i, j] = 1.0
-
-
-@compiled
-def smooth_levels(level: Floats32, seen: Floats32, smooth: Floats32, held: Floats32) -> None:
-    """Fill in means of the levels seen in 3 by 3 cells, mirrored at the rim, and the shares that are seen."""
-    side = len(level)
-    total, count = np.empty(side + 2, np.float32), np.empty(side + 2, np.float32)
-    for i in range(side):
-        before, after = abs(i - 1), side - 1 - abs(side - 2 - i)
-        for j in range(side):
-            total[j + 1] = level[before, j] + level[i, j] + level[after, j]
-            count[j + 1] = seen[before, j] + seen[i, j] + seen[after, j]
-        total[0], total[-1], count[0], count[-1] = total[2], total[-3], count[2], count[-3]
-        for j in range(side):
-            n = count[j] + count[j + 1] + count[j + 2]
-            held[i, j] = n / np.float32(9)
-            smooth[i, j] = (total[j] + total[j + 1] + total[j + 2]) / max(n, np.float32(0.9))
+    smooth_levels(level, seen, smooth, held)
