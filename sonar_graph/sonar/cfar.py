@@ -31,13 +31,13 @@ DB_PER_NEPER = 10.0 / np.log(10.0)
 class DetectionParams(Section):
     """Settings of the candidate selection; lengths are on the ground, for landmarks of about 0.3 m."""
 
-    false_alarm: float = Field(1e-3, gt=0, lt=0.5)
+    false_alarm: float = Field(4e-3, gt=0, lt=0.5)
     """Probability that a pixel of background exceeds the threshold."""
     smoothing_m: float = Field(0.03, gt=0)
     """Side of the patch over which levels are averaged."""
     background_m: float = Field(0.9, gt=0)
     """Side of the neighbourhood of the background; well over twice the size of a landmark."""
-    closing_m: float = Field(0.03, ge=0)
+    closing_m: float = Field(0.05, ge=0)
     """Gaps up to this width are bridged."""
     min_area_m2: float = Field(0.008, ge=0)
     """Smaller regions are rejected."""
