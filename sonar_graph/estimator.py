@@ -100,6 +100,20 @@ def withheld_of(estimator: Estimator) -> list[str]:
     return list(estimator.withheld()) if isinstance(estimator, TellsWithheld) else []
 
 
+@runtime_checkable
+class HasNewestLandmarks(Protocol):
+    """Optional part of the contract: an estimator whose `Estimator.landmarks` takes longer the longer a run is."""
+
+    def newest_landmarks(self) -> LandmarkMap:
+        """Landmarks as of the last update, in the time of an update."""
+        ...
+
+
+def newest_landmarks_of(estimator: Estimator) -> LandmarkMap:
+    """Landmarks for who cannot wait, of a live run: all there are where it does not implement `HasNewestLandmarks`."""
+    return estimator.newest_landmarks() if isinstance(estimator, HasNewestLandmarks) else estimator.landmarks()
+
+
 def installed_estimators() -> dict[str, EntryPoint]:
     """Entry points by name; nothing is imported. Of two with one name the first found wins."""
     found: dict[str, EntryPoint] = {}

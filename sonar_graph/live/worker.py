@@ -13,14 +13,21 @@ from dataclasses import dataclass
 from typing import Any
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.estimator import Estimator, load_estimator, make_params, refused_rows_of, withheld_of
+from sonar_graph.estimator import (
+    Estimator,
+    load_estimator,
+    make_params,
+    newest_landmarks_of,
+    refused_rows_of,
+    withheld_of,
+)
 from sonar_graph.files import READY, OwnProcess, Tell, serve
 from sonar_graph.measurements import Measurements
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import Estimate, LandmarkMap, RefusedRow, Trajectory
 
 MAP_SHARE = 20.0
-"""Time between two maps over the time that one takes to solve."""
+"""Time between two maps over the time that one takes."""
 LEAST_MAP_S = 1.0
 MOST_AT_ONCE = 100
 """Number of steps in one request, so that estimates come while many wait."""
@@ -106,7 +113,7 @@ def _answer(request: Any, tell: Tell) -> object:  # noqa: ARG001  # of `serve`
     _Served.estimates += found
     before_s = time.perf_counter()
     if found and before_s >= _Served.next_map_s:
-        landmarks_now = estimator.landmarks()
+        landmarks_now = newest_landmarks_of(estimator)
         after_s = time.perf_counter()
         _Served.next_map_s = after_s + max(LEAST_MAP_S, MAP_SHARE * (after_s - before_s))
     return Answer(found, landmarks_now, withheld_of(estimator), longest_s)

@@ -27,7 +27,14 @@ from sonar_graph.slam.frontend import Frontend
 from sonar_graph.slam.keyframes import KeyframeParams, Keyframes
 from sonar_graph.slam.landmarks import IdentityParams, MixtureIdentity, RobustIdentity
 from sonar_graph.slam.models import KernelParams, RobustKernel
-from sonar_graph.slam.smoother import HistoryParams, JointCovariance, Smoother, SmootherParams, WholeHistory
+from sonar_graph.slam.smoother import (
+    HistoryParams,
+    JointCovariance,
+    Marginals,
+    Smoother,
+    SmootherParams,
+    WholeHistory,
+)
 from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, Refusal, RefusedRow, Trajectory
 from sonar_graph.tagged_sections import misfits
 
@@ -308,12 +315,16 @@ class Isam2:
 
     def landmarks(self) -> LandmarkMap:
         """Landmarks by identity after solving the whole graph, with marginal covariances."""
-        values, marginals, ids = self._sightings.smoothed()
-        return LandmarkMap(
-            np.array(ids, dtype=np.int64),
-            np.array([values.atPoint3(L(i)) for i in ids]).reshape(-1, 3),
-            np.array([marginals.marginalCovariance(L(i)) for i in ids]).reshape(-1, 3, 3),
-        )
+        return map_of(*self._sightings.smoothed())
+
+    def newest_landmarks(self) -> LandmarkMap:
+        """Landmarks by identity as of the last update of iSAM2, in milliseconds however long the run is.
+
+        Covariances are those of `joint_covariance` over the window.
+        """
+        smoother = self._smoother
+        ids = [i for i in smoother.landmark_ids if smoother.in_window([L(i)])]
+        return map_of(smoother.values, smoother.marginals, ids)
 
     def detections(self) -> DetectionLog:
         """Outcome of each detection; of doubtful identities in the history of `trajectory`."""
@@ -329,3 +340,12 @@ class Isam2:
     def refused_rows(self) -> list[RefusedRow]:
         """Rows of all sensors but the sonar that are not used, and why."""
         return self._keyframes.refused
+
+
+def map_of(values: gtsam.Values, marginals: Marginals | gtsam.ISAM2, ids: list[int]) -> LandmarkMap:
+    """Map of landmarks with these identities, from a solution and what gives its marginal covariances."""
+    return LandmarkMap(
+        np.array(ids, dtype=np.int64),
+        np.array([values.atPoint3(L(i)) for i in ids]).reshape(-1, 3),
+        np.array([marginals.marginalCovariance(L(i)) for i in ids]).reshape(-1, 3, 3),
+    )

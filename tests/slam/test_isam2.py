@@ -203,6 +203,31 @@ def test_landmarks_list_and_covariances_are_of_one_choice() -> None:
     assert any(differing), "else it is not seen which is asked"
 
 
+def test_the_newest_landmarks_are_those_of_the_window_and_within_their_doubt_of_the_solution(basin) -> None:
+    """For a live run, whose map must not wait for the solution of the whole graph; asking leaves no trace."""
+    estimator, _ = ran(basin, 7.0)
+    newest, solved = estimator.newest_landmarks(), estimator.landmarks()
+    np.testing.assert_array_equal(newest.ids, solved.ids)
+    assert len(newest) == 4
+    for landmark_id, position, cov in zip(newest.ids.tolist(), newest.positions, newest.covariances, strict=True):
+        np.testing.assert_array_equal(position, estimator.values.atPoint3(L(landmark_id)))
+        np.testing.assert_allclose(cov, estimator.marginal(landmark=landmark_id, over="window"), rtol=1e-9)
+    off = newest.positions - solved.positions
+    nees = np.einsum("ni,nij,nj->n", off, np.linalg.inv(newest.covariances), off)
+    assert nees.max() < 1.0
+    ratio = np.trace(newest.covariances, axis1=1, axis2=2) / np.trace(solved.covariances, axis1=1, axis2=2)
+    assert ((ratio > 0.8) & (ratio < 1.25)).all()
+    assert estimator.newest_landmarks().positions.tobytes() == newest.positions.tobytes()
+
+
+def test_estimators_without_a_quick_map_give_the_whole_one(basin) -> None:
+    kind = load_estimator("ekf-slam")
+    estimator = kind(basin.calibration, Odometry(basin.calibration))
+    for step in basin.replay(basin.instants(1.0)):
+        estimator.process(step)
+    assert newest_landmarks_of(estimator).positions.tobytes() == estimator.landmarks().positions.tobytes()
+
+
 LANDMARK, BEFORE = 2, 1
 
 
