@@ -12,7 +12,7 @@ from gtsam.symbol_shorthand import L
 from scipy.stats import chi2
 
 from sonar_graph.errors import CalibrationError, EstimatorError
-from sonar_graph.estimator import make_params
+from sonar_graph.estimator import load_estimator, make_params, newest_landmarks_of
 from sonar_graph.evaluation.consistency import normalised_squares
 from sonar_graph.logs.convert.mrclam import read_mrclam
 from sonar_graph.measurements import NS_PER_S, Floats, LandmarkDetections, Measurements

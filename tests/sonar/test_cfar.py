@@ -7,10 +7,12 @@ import pytest
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy import stats
 from scipy.ndimage import uniform_filter
+from scipy.spatial.transform import Rotation
 
 from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.errors import CalibrationError, MeasurementError
 from sonar_graph.measurements import Floats
+from sonar_graph.simulation.sonar_image import FrameSimulator, ImageOptions, place_landmark
 from sonar_graph.sonar import cfar
 from sonar_graph.sonar.appearance import AppearanceParams
 from sonar_graph.sonar.geometry import FloorView
@@ -358,3 +360,30 @@ def test_the_edge_of_the_square_is_none_of_a_part(settings):
     filled, larger = (cfar.bright_parts(design_of(MIDDLE, size_m=size_m), set_to(**settings)) for size_m in (0.2, 0.5))
     for one, other in zip(filled, larger, strict=True):
         assert one == pytest.approx(other, rel=0.06, abs=0.003)
+
+
+def share_near_weak_landmarks(settings: cfar.DetectionParams) -> float:
+    """Share of frames of the simulator with a candidate within 6 cm of a landmark 6 dB weaker than designed."""
+    sonar_m, tilt = np.array([0.0, 0.0, 1.5]), Rotation.from_euler("Y", 22, degrees=True)
+    found = []
+    for design in DEFAULT_DESIGNS:
+        weak = replace(design, mask=np.where(design.mask > 0, design.mask - 6.0, design.mask))
+        centre_m = np.array([3.6, 0.0, design.height_m])
+        x, y, z = tilt.inv().apply(centre_m - sonar_m)
+        r, a = float(np.sqrt(x**2 + y**2 + z**2)), float(np.arctan2(y, x))
+        for seed, heading in enumerate(np.linspace(0, 2.0, 8)):
+            landmark = place_landmark(weak, centre_m, heading, 0.0)
+            simulator = FrameSimulator(ImageOptions(window_m=5.0), [landmark], 0.0, seed)
+            view = FloorView(tilt.as_matrix(), sonar_m[2] - design.height_m)
+            level_db = simulator.level_db(sonar_m, tilt, 0, 3.6)
+            candidates = cfar.select_candidates(
+                level_db, simulator.ranges_m(), simulator.azimuths_rad(), view, settings
+            )
+            off_m = np.hypot(candidates.range_m - r, r * (candidates.azimuth_rad - a))[candidates.accepted]
+            found.append(off_m.min(initial=np.inf) < 0.06)
+    return float(np.mean(found))
+
+
+def test_weak_landmarks_are_candidates_and_break_up_at_a_strict_threshold_with_narrow_gaps():
+    assert share_near_weak_landmarks(cfar.DetectionParams()) > 0.75
+    assert share_near_weak_landmarks(cfar.DetectionParams(false_alarm=1e-3, closing_m=0.03)) < 0.5
