@@ -88,8 +88,8 @@ class IdentityParams(Section):
 
     rule: Rule = "virtual-evidence"
     """virtual-evidence: ours, bounded; jeffrey: the 2014 paper's equations as printed, every frame counting in full."""
-    unknown_prior: float = Field(6 / 7, gt=0, lt=1)
-    """Belief in "none of them" about a new track: six unknown objects for each landmark. The least whole number with
+    unknown_prior: float = Field(12 / 13, gt=0, lt=1)
+    """Belief in "none of them" about a new track: twelve unknown objects for each landmark. The least whole number with
     which strangers of the calibration basins are rarely accepted (docs/theory/recognition.md)."""
     forgetting: float = Field(1e-4, ge=0, lt=1)
     """Share of a belief that returns to that of a new track, per frame; of the rule jeffrey only."""
