@@ -178,9 +178,9 @@ def _posteriors(fits: confusion_fit.LabelledFits, model: Confusion) -> np.ndarra
 
 
 def test_posteriors_of_tracks_are_calibrated_where_many_were_seen():
-    """Landmarks are a sixth as many as unknown objects, as the prior says."""
+    """Landmarks are a twelfth as many as unknown objects, as the prior says."""
     of = [_fits(800, 4.0, seed) for seed in (0, 1)]
-    rows = np.flatnonzero((of[0].label == 2) | (np.arange(2400) % 12 == 0))
+    rows = np.flatnonzero((of[0].label == 2) | (np.arange(2400) % 24 == 0))
     learnt, unseen = (some(fits, rows) for fits in of)
     model = confusion_fit.estimate_confusion(learnt, (1, 2), {})
     found, label = _posteriors(unseen, model), confusion_fit.track_sums(unseen)[2]

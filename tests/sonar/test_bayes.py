@@ -155,7 +155,7 @@ def _after(
 
 
 def test_a_resting_sonar_learns_nothing_and_the_papers_rule_counts_every_frame():
-    first, *rest = _after([(0, 0, 0)] * 20)
+    first, *rest = _after([(0, 0, 0)] * 20, unknown_prior=2 / 3)
     assert first > 0.3
     assert max(rest) <= first
     theirs = _after([(0, 0, 0)] * 200, "jeffrey")
