@@ -56,6 +56,7 @@ BEAMS = 128
 METRES_A_PIXEL = 0.01
 LEAST_OVERLAP = 0.2
 SETTINGS = DetectionParams(
+    false_alarm=1e-3,
     smoothing_m=0.07,
     background_m=1.5,
     closing_m=0.07,
