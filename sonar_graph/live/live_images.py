@@ -138,10 +138,10 @@ class LiveImages:
             if missed := engine.counts.received[self._topic] - (message.topic == self._topic):
                 engine.counts.dropped[self._topic, TOO_EARLY] += missed
             assert engine.calibration is not None
-            lacks = "" if "depth" in engine.in_use else f"{NO_DEPTH}, until it comes"
-            lacks = lacks if engine.calibration.floor is not None else NO_HEIGHT
-            if lacks:
-                engine.remarks.append(f"warning: {self._topic}: {lacks}")
+            if engine.calibration.floor is None:
+                engine.remarks.append(f"warning: {self._topic}: {NO_HEIGHT}")
+            elif "depth" not in engine.in_use:
+                engine.remarks.append(f"warning: {self._topic}: {NO_DEPTH}, until it comes")
 
     def _read(self, message: Message) -> None:
         topic = self._engine.topics[self._topic].empty()
