@@ -292,6 +292,8 @@ def calibrate(
             f"Caution: fewer than {FEW_TRACKS} tracks of {', '.join(few)}: frames of one track are alike; "
             "give more logs before the model is relied on"
         )
+    if assumed := measured.provenance.get("confusion matrix"):
+        answers().print(f"Confusion matrix: {assumed}; the rule of 2014 alone uses it")
     echo(f"Model: {path}")
 
 

@@ -32,6 +32,7 @@ from sonar_graph.sonar import (
     ObjectSighting,
     Recogniser,
     RecogniserParams,
+    confusion_for,
     mark_of,
     posterior_mean_rows,
     read_confusion,
@@ -42,7 +43,7 @@ SAME_M, APART_M = 0.08, 0.40
 NO_LABEL = -2
 NONE = -1
 LEAST_FRAMES = 3
-"""Labelled frames that every class needs."""
+"""Labelled frames from which a class is measured."""
 PRIOR_SHARE = 0.25
 """Standard deviation of what is fitted about the shipped model, as a share of it; of looks, of their logarithm."""
 
@@ -217,14 +218,16 @@ def estimate_confusion(
 ) -> Confusion:
     """Fit the model to labelled frames, all classes weighing the same, for designs with these ids in their order.
 
-    Without the designs themselves, as measured, no recogniser accepts the model.
+    Without the designs themselves, as measured, no recogniser accepts the model. A design with too few frames keeps the
+    row of the confusion matrix that it has without calibration (`confusion_for`), and the provenance says so.
 
-    Raises `CalibrationError` when a class has too few frames, naming it.
+    Raises `CalibrationError` when no landmark has enough frames, or what is none has too few, naming them.
     """
     counts = np.bincount(fits.label, minlength=len(ids) + 1)
     names = [*(f"landmark {i}" for i in ids), "no landmark"]
+    is_known = counts >= LEAST_FRAMES
     poor = [f"{name}: {count}" for name, count in zip(names, counts.tolist(), strict=True) if count < LEAST_FRAMES]
-    if poor:
+    if not is_known[-1] or not is_known[:-1].any() or (poor and not designs):
         raise CalibrationError(
             f"too few labelled frames ({'; '.join(poor)}; needed {LEAST_FRAMES} of each): give longer or more logs"
         )
@@ -232,6 +235,8 @@ def estimate_confusion(
     weights, looks = fit_weights(fits, np.array(shipped.weights), shipped.looks)
     odds = np.pad(fits.evidence @ weights, ((0, 0), (0, 1)))
     matrix = confusion_rows(soft_scores(odds, looks), fits.label, trials_of(fits))
+    if poor:
+        matrix = np.where(is_known[:, None], matrix, confusion_for(designs).array())
     height_bias_m, error = without_height(fits)
     usual, sigmas, power = accuracy(error, fits.bound_m, fits.track, shipped.bound_power)
     spread = sigmas * (fits.bound_m / usual) ** power
@@ -251,6 +256,7 @@ def estimate_confusion(
         roughness=roughness_of_tracks(fits),
         report_interval_s=report_interval_s(error / spread, fits.track, fits.stamp_ns, shipped.report_interval_s),
         provenance=provenance
+        | ({"confusion matrix": f"as without calibration for {', '.join(poor)} frames"} if poor else {})
         | {f"frames of {n}": str(c) for n, c in zip(names, counts.tolist(), strict=True)}
         | {f"tracks of {n}": str(c) for n, c in zip(names, tracks_of(fits).tolist(), strict=True)},
     )
@@ -340,7 +346,8 @@ def confusion_rows(scores: Floats, label: Ints, trials: Ints) -> Floats:
 
     Frames of a track repeat each other, so that tracks are the trials, not frames.
     """
-    means = np.array([scores[label == k].mean(axis=0) for k in range(scores.shape[1])])
+    sums = np.array([scores[label == k].sum(axis=0) for k in range(scores.shape[1])])
+    means = sums / np.maximum(np.bincount(label, minlength=len(sums)), 1)[:, None]
     return posterior_mean_rows(means, trials)
 
 

@@ -215,7 +215,15 @@ def read_confusion(path: Path) -> Confusion:
 
 
 def confusion_for(designs: Sequence[LandmarkDesign]) -> Confusion:
-    """The model that ships for the designs that ship; for others an assumed one, which says so in its provenance."""
+    """The model that ships for the designs that ship; for others an assumed one, which says so in its provenance.
+
+    Examples
+    --------
+    >>> from sonar_graph.devices import DEFAULT_DESIGNS
+    >>> from sonar_graph.sonar import confusion_for
+    >>> confusion_for(DEFAULT_DESIGNS[:2]).provenance["origin"][:18]
+    'assumed: 90% right'
+    """
     ids = tuple(design.id for design in designs)
     shipped = read_confusion(SHIPPED)
     marks = tuple(map(mark_of, designs))

@@ -246,6 +246,24 @@ def test_a_class_with_too_few_frames_is_named():
         confusion_fit.estimate_confusion(some(_fits(100, 0.1), np.arange(205)), (1, 2), {})
 
 
+def test_a_design_that_was_not_seen_keeps_the_row_of_no_calibration_and_moves_nothing_else():
+    """Landmark 2 of two is missing; no landmark at all, or nothing that is none, is refused."""
+    first, second = (replace(DEFAULT_DESIGNS[0], id=k) for k in (1, 2))
+    fits = _fits(100, 0.1)
+    seen = some(fits, np.flatnonzero(fits.label != 1))
+    model = confusion_fit.estimate_confusion(seen, (1, 2), {}, (first, second))
+    alone = confusion_fit.estimate_confusion(fits, (1, 2), {}, (first, second))
+    assert model.matrix[1] == confusion_for((first, second)).matrix[1] != alone.matrix[1]
+    assert model.matrix[0][0] == pytest.approx(alone.matrix[0][0], abs=0.05)
+    assert model.range_sigma_m == pytest.approx(alone.range_sigma_m, rel=0.2)
+    assert model.provenance["confusion matrix"] == "as without calibration for landmark 2: 0 frames"
+    assert "confusion matrix" not in alone.provenance
+    for label in (0, 2):
+        only = some(fits, np.flatnonzero(fits.label == label))
+        with pytest.raises(CalibrationError, match="too few labelled frames"):
+            confusion_fit.estimate_confusion(only, (1, 2), {}, (first, second))
+
+
 def test_sigmas_are_root_mean_squares_at_the_usual_bound():
     """A landmark that is always seen 3 cm too far errs by that, and not by the spread about the mean."""
     fits = replace(_fits(300, 0.1), range_per_height=np.zeros(900))
