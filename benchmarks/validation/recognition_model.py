@@ -168,7 +168,7 @@ def nats_lost(fits: LabelledFits, fitted: float) -> dict[str, float]:
     once = 1.0 / np.bincount(fits.track)[fits.track]
 
     def loss(power: float) -> float:
-        usual, sigmas, _ = accuracy(error, fits.bound_m, fits.track, 1.0, (power, power))
+        usual, sigmas, _ = accuracy(error, fits.bound_m, fits.track, powers=(power, power))
         variances = (sigmas * (fits.bound_m / usual) ** power) ** 2
         terms = 0.5 * (np.log(variances) + error**2 / variances).sum(axis=1)
         known = np.isfinite(terms)
@@ -213,7 +213,7 @@ def main() -> None:
     near = [part for seed, part in ours.items() if is_as_designed(conditions_of(seed))] + plain
     fits_near = together(near).fits()
     of_near = estimate_confusion(fits_near, IDS, {}, DEFAULT_DESIGNS)
-    usual, sigmas, _ = accuracy(without_height(fits_near)[1], fits_near.bound_m, fits_near.track, 1.0, (1.0, 1.0))
+    usual, sigmas, _ = accuracy(without_height(fits_near)[1], fits_near.bound_m, fits_near.track, powers=(1.0, 1.0))
     of_accuracy = *sigmas.tolist(), *usual.tolist(), 1.0, of_near.report_interval_s, 0.0
     accurate = dict(zip(ACCURATE, of_accuracy, strict=True))
     model = model.model_copy(update=accurate)

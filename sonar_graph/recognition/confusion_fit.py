@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize, minimize_scalar
@@ -68,6 +69,26 @@ class LabelledFits:
     """`ObjectSighting.range_per_height`, shape (n,)."""
     stamp_ns: Ints
     """Stamp of each frame, shape (n,)."""
+
+
+class Accuracy(NamedTuple):
+    """Standard deviations along the ray and across it, as they grow with the bounds of a fit."""
+
+    usual_m: Floats
+    """Usual bounds, shape (2,)."""
+    usual_sigmas_m: Floats
+    """Standard deviations at these, shape (2,)."""
+    power: float
+
+    @classmethod
+    def of(cls, model: Confusion) -> Accuracy:
+        """Accuracy of a measured model."""
+        usual_m = np.array([model.range_bound_m, model.across_bound_m])
+        return cls(usual_m, np.array([model.range_sigma_m, model.across_sigma_m]), model.bound_power)
+
+    def sigmas_m(self, bound_m: Floats) -> Floats:
+        """Standard deviations at bounds, shape (..., 2)."""
+        return np.asarray(self.usual_sigmas_m * (bound_m / self.usual_m) ** self.power)
 
 
 class LabelledSightings:
@@ -238,8 +259,7 @@ def estimate_confusion(
     if poor:
         matrix = np.where(is_known[:, None], matrix, confusion_for(designs).array())
     height_bias_m, error = without_height(fits)
-    usual, sigmas, power = accuracy(error, fits.bound_m, fits.track, shipped.bound_power)
-    spread = sigmas * (fits.bound_m / usual) ** power
+    found = accuracy(error, fits.bound_m, fits.track, Accuracy.of(shipped))
     return Confusion(
         ids=ids,
         designs=tuple(map(mark_of, designs)),
@@ -247,14 +267,16 @@ def estimate_confusion(
         weights=tuple(weights.tolist()),
         looks=looks,
         doubt=shipped.doubt,
-        range_sigma_m=float(sigmas[0]),
-        across_sigma_m=float(sigmas[1]),
-        range_bound_m=float(usual[0]),
-        across_bound_m=float(usual[1]),
-        bound_power=power,
+        range_sigma_m=float(found.usual_sigmas_m[0]),
+        across_sigma_m=float(found.usual_sigmas_m[1]),
+        range_bound_m=float(found.usual_m[0]),
+        across_bound_m=float(found.usual_m[1]),
+        bound_power=found.power,
         height_bias_m=height_bias_m,
         roughness=roughness_of_tracks(fits),
-        report_interval_s=report_interval_s(error / spread, fits.track, fits.stamp_ns, shipped.report_interval_s),
+        report_interval_s=report_interval_s(
+            error / found.sigmas_m(fits.bound_m), fits.track, fits.stamp_ns, shipped.report_interval_s
+        ),
         provenance=provenance
         | ({"confusion matrix": f"as without calibration for {', '.join(poor)} frames"} if poor else {})
         | {f"frames of {n}": str(c) for n, c in zip(names, counts.tolist(), strict=True)}
@@ -298,13 +320,18 @@ def without_height(fits: LabelledFits) -> tuple[float, Floats]:
 
 
 def accuracy(
-    error: Floats, bound: Floats, track_of: Ints, prior_power: float, powers: tuple[float, float] = (0.0, 4.0)
-) -> tuple[Floats, Floats, float]:
+    error: Floats,
+    bound: Floats,
+    track_of: Ints,
+    prior: Accuracy | None = None,
+    powers: tuple[float, float] = (0.0, 4.0),
+) -> Accuracy:
     """Usual bounds along the ray and across, their sigmas there, and the power of the bound, as `Confusion` has them.
 
-    The most probable ones for normal errors of which each track counts once, with a normal prior about the power given
-    (`PRIOR_SHARE`) and limits. The usual bound is the geometric mean. Variances are those of n tracks of which one is
-    lost to the height: errors of a track repeat, and the height was fitted to these tracks.
+    The most probable ones for normal errors of which each track counts once, with a normal prior about the power of the
+    given accuracy (`PRIOR_SHARE`) and limits. The usual bound is the geometric mean. Variances are those of n tracks of
+    which one is lost to the height: errors of a track repeat, and the height was fitted to these tracks. The variances
+    of the given accuracy count as ``1 / (2 PRIOR_SHARE^2)`` tracks, whose sigma is known to `PRIOR_SHARE` of itself.
     """
     known = np.isfinite(error).all(axis=1) & np.isfinite(bound).all(axis=1)
     error, bound, (_, track) = error[known], bound[known], np.unique(track_of[known], return_inverse=True)
@@ -316,11 +343,15 @@ def accuracy(
         return np.asarray(np.average(error**2 * np.exp(-2 * power * growth), axis=0, weights=once))
 
     def loss(power: float) -> float:
-        off = (power - prior_power) / (PRIOR_SHARE * prior_power)
+        off = (power - prior.power) / (PRIOR_SHARE * prior.power) if prior else 0.0
         return float(0.5 * off**2 + 0.5 * tracks * np.log(np.maximum(variances(power), tiny)).sum())
 
     power = float(minimize_scalar(loss, bounds=powers, method="bounded").x)
-    return usual, np.sqrt(variances(power) * tracks / (tracks - 1)), power
+    variance = variances(power) * tracks / (tracks - 1)
+    if prior:
+        before = 1 / (2 * PRIOR_SHARE**2)
+        variance = (tracks * variance + before * prior.sigmas_m(usual) ** 2) / (tracks + before)
+    return Accuracy(usual, np.sqrt(variance), power)
 
 
 def report_interval_s(error: Floats, track_of: Ints, stamp_ns: Ints, prior_s: float) -> float:
