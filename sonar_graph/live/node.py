@@ -59,7 +59,8 @@ MOST_WAITING_S = 2.0
 
 MOST_STEPS_AT_ONCE = 50
 MOST_DURATIONS = 20_000
-WARM_UP_S = 20.0
+WARM_UP = MissionOptions(duration_s=80.0, frame_rate_hz=10.0, dvl_dropouts_per_hour=240.0, dvl_dropout_s=3.0)
+"""Run on which all is compiled: until keyframes are marginalised, and with frames in gaps of the Doppler log."""
 
 
 class LiveRun:
@@ -106,7 +107,7 @@ class LiveRun:
         self._forms = PoseForms()
         self._answers: deque[Answer] = deque()
         self._images = LiveImages(self.engine, options)  # compiles in its process meanwhile
-        warm_up = simulate_mission(MissionOptions(duration_s=WARM_UP_S))
+        warm_up = simulate_mission(WARM_UP)
         self._worker = Worker(
             options.estimator,
             dict(options.overrides),
