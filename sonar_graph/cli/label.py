@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import webbrowser
 from pathlib import Path
 from threading import Thread
@@ -75,10 +76,15 @@ def label(
     with LabelServer(
         desk, lambda nonce: page_of(log, path, known, desk, nonce), [one.id for one in known], port
     ) as server:
-        serve(server, log, path, labels, is_shown=not no_browser)
+        serve(server, path, labels, is_shown=not no_browser)
+    options = {"--designs": designs, "--calibration": reading.calibration, "--log-config": reading.log_config}
+    given = [f"{name} {shlex.quote(str(value))}" for name, value in options.items() if value is not None]
+    given += [f"--topic {shlex.quote(text)}" for text in reading.topics or []]
+    names = f"{shlex.quote(str(log))} --labels {shlex.quote(str(path))}"
+    echo(" ".join(["Next: sonar-graph calibrate", names, *given, "-o model.json"]))
 
 
-def serve(server: LabelServer, log: Path, path: Path, labels: Labels, *, is_shown: bool) -> None:
+def serve(server: LabelServer, path: Path, labels: Labels, *, is_shown: bool) -> None:
     """Serve until Ctrl-C, then say what there is."""
     echo(f"{len(server.desk.frames)} frames, {len(labels.labels)} labels so far. The page: {server.address}")
     echo("Ctrl-C ends.")
@@ -91,7 +97,6 @@ def serve(server: LabelServer, log: Path, path: Path, labels: Labels, *, is_show
             pass
     server.shutdown()
     echo(f"\nLabels: {path} ({len(server.desk.labels)})")
-    echo(f"Next: sonar-graph calibrate {log} --labels {path} -o model.json")
 
 
 def page_of(log: Path, path: Path, designs: tuple[LandmarkDesign, ...], desk: LabelDesk, nonce: str) -> str:

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from sonar_graph.live import Publisher
 
 RECORD, COUNTS = "record.mcap", "live.json"
+SETTLE_S = 1.0
+"""Time for subscribers to find all topics, and to get the last messages."""
 DOMAIN = Annotated[int, typer.Option(min=0, max=232, help="ROS_DOMAIN_ID.")]
 
 
@@ -56,7 +58,9 @@ def live(
     ] = None,
     resume: Annotated[
         Path | None,
-        typer.Option(metavar="RECORD", exists=True, dir_okay=False, help="Go on after a crash, from the record."),
+        typer.Option(
+            metavar="RECORD", exists=True, dir_okay=False, help="Go on after a crash, from its record and calibration."
+        ),
     ] = None,
     duration: Annotated[float | None, typer.Option(metavar="SECONDS", help="End after so long.")] = None,
 ) -> None:
@@ -77,7 +81,7 @@ def live(
         open_outlets,
         recorded_messages,
     )
-    from sonar_graph.logs import LiveRecord, read_log
+    from sonar_graph.logs import LiveRecord, read_log, resumed_calibration
 
     reading = ReadingOptions(calibration, topics, log_config)
     record = output / RECORD
@@ -86,7 +90,8 @@ def live(
         raise LogError(f"{record}: a record is there already: {advice}")
     overrides = estimator_settings(settings, [estimator]).get(estimator, {})
     params = check_request(estimator, overrides)
-    options = LiveOptions(estimator, overrides, rate_hz, lateness, reading.choices, reading.config, reading.given)
+    given = reading.given if resume is None else resumed_calibration(resume, reading.given)
+    options = LiveOptions(estimator, overrides, rate_hz, lateness, reading.choices, reading.config, given)
     with open_link(connect or [DEFAULT_ROUTER], domain) as link, interrupt_event() as ended:
         output.mkdir(parents=True, exist_ok=True)
         outlets = open_outlets(link, foxglove)
@@ -146,7 +151,9 @@ def play(
         list[str] | None, typer.Option(metavar="ENDPOINT", help="Router to send to, instead of listening.")
     ] = None,
     domain: DOMAIN = 0,
-    wait: Annotated[float, typer.Option(metavar="SECONDS", help="Time for subscribers to find the topics.")] = 1.0,
+    wait: Annotated[
+        float, typer.Option(metavar="SECONDS", min=0.0, help="Longest time to wait for somebody who listens.")
+    ] = 30.0,
     after: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Wait until this file is there, such as one that a script makes."),
@@ -165,7 +172,13 @@ def play(
             unknown.add(topic)
             echo(f"not sent: {topic}: {error}")
     with interrupt_event() as ended:
-        ended.wait(wait)
+        last_s = time.monotonic() + wait
+        if wait:
+            echo(f"waiting up to {wait:g} s for somebody who listens")
+        while not any(one.is_heard for one in publishers.values()) and time.monotonic() < last_s:
+            if ended.wait(0.05):
+                break
+        ended.wait(SETTLE_S)
         while after is not None and not after.exists() and not ended.wait(0.05):
             pass
         echo(f"playing {log} to {', '.join(connect or [listen])}; Ctrl-C ends")
@@ -173,7 +186,7 @@ def play(
         count, latest_s = play_messages(
             wanted, rate, lambda message: publishers[message.topic].put(message.payload), ended.is_set
         )
-        ended.wait(wait)
+        ended.wait(SETTLE_S)
     session.close()
     echo(f"{count} messages of {len(publishers)} topics, the latest {latest_s * 1e3:.0f} ms behind its time")
 

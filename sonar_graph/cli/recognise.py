@@ -100,6 +100,7 @@ class RecogniserOptions:
 
     def params(self, settings: list[str] | None = None) -> RecogniserParams:
         """Settings of the recogniser."""
+        from sonar_graph.devices import DEFAULT_DESIGNS
         from sonar_graph.sonar import RecogniserParams, read_confusion
 
         values = nested_settings(settings)
@@ -110,7 +111,8 @@ class RecogniserOptions:
                 )
             identity["rule"] = self.rule
         if self.model is not None:
-            values["confusion"] = read_confusion(self.model)
+            values["confusion"] = confusion = read_confusion(self.model)
+            confusion.check_designs(self.read_designs() or DEFAULT_DESIGNS, str(self.model))
         return validated(RecogniserParams, values, "recogniser")
 
     def recogniser(

@@ -180,7 +180,7 @@ class LiveRun:
         if not self.engine.topics:
             return "no message came; is the domain right, and does anything send?"
         came = ", ".join(f"{name} ({topic.type_name})" for name, topic in self.engine.topics.items())
-        return f"an estimate needs an IMU and a Doppler log; there came {came}"
+        return f"an estimate needs two seconds of an IMU and a Doppler log; there came {came}"
 
     def turn(self, timeout_s: float = 0.05) -> None:
         """Take what has come, and send what follows from it."""

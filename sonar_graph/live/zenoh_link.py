@@ -179,6 +179,12 @@ class Publisher:
         self._sender = os.urandom(16)
         self._sequence = 0
 
+    @property
+    def is_heard(self) -> bool:
+        """True while anybody subscribes to it; of a topic of static frames zenoh does not say."""
+        status = getattr(self._publisher, "matching_status", None)
+        return status is not None and bool(status.matching)
+
     def put(self, payload: bytes) -> None:
         """Send one message."""
         self._sequence += 1

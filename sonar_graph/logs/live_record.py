@@ -21,9 +21,9 @@ from sonar_graph.calibration import Calibration
 from sonar_graph.errors import LogError
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.logs.cdr import Value, definition, encode, parse_definition, short_name
-from sonar_graph.logs.mcap import LIBRARY, ROSBAG2_METADATA, TRANSIENT_LOCAL, Keep, Recording, Topic, seal
+from sonar_graph.logs.mcap import LIBRARY, ROSBAG2_METADATA, TRANSIENT_LOCAL, Keep, Recording, Topic, scan, seal
 from sonar_graph.logs.roles import DROPPED, TF, Choice
-from sonar_graph.logs.vehicle_setup import METADATA, read_notes
+from sonar_graph.logs.vehicle_setup import METADATA, PartialCalibration, read_calibration, read_notes
 
 if TYPE_CHECKING:
     from sonar_graph.logs.reading import Assembly
@@ -62,6 +62,28 @@ def leave_out_dropped(recording: Recording) -> dict[str, str]:
     counts = Counter((name, reason) for (name, _), reason in dropped.items())
     texts = [f"{count} of {name}: {reason}" for (name, reason), count in sorted(counts.items())]
     return {"log.live": "not given to the estimator live, so left out: " + "; ".join(texts)} if texts else {}
+
+
+def resumed_calibration(path: Path, given: PartialCalibration | None) -> PartialCalibration | None:
+    """Fields with which a live run goes on from a record: those that it had, and before them what the user gives now.
+
+    Sensors that it did not use are left out: their mountings may still come. None without either.
+
+    Raises
+    ------
+    CalibrationError
+        When the record has a calibration that is none.
+    """
+    recording = scan(path, lambda _: Keep.NONE)
+    recorded, config = read_calibration(recording), recorded_config(recording)
+    if recorded is None or config is None:
+        return given
+    values = {name: value for name, value in recorded.model_dump(mode="json").items() if value is not None}
+    for role, table in config.tables.items():
+        if table.get("use") is False:
+            values.pop(role, None)
+    recorded_fields = PartialCalibration(values, str(path))
+    return recorded_fields if given is None else given.over(recorded_fields)
 
 
 def recorded_config(recording: Recording) -> LogConfig | None:

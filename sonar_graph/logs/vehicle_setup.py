@@ -123,6 +123,14 @@ def encode_mountings(calibration: Calibration) -> Bytes:
     return encode(parse_definition(TF, definition(TF)), 1, values, {"transforms": len(mountings)})
 
 
+OTHER_FILES = (
+    ({"ids", "matrix"}, "a model of recognition", "--model"),
+    ({"landmark"}, "a file of landmark designs", "--designs"),
+    ({"log", "labels"}, "a file of labels", "--labels"),
+)
+"""Fields by which other files of this package are known, what these are, and the option for them."""
+
+
 @dataclass(frozen=True)
 class PartialCalibration:
     """Fields that a user gives; the others are left to the log. ``false`` takes away an optional one (``floor``)."""
@@ -174,7 +182,14 @@ class PartialCalibration:
         if not isinstance(values, dict):
             what = "expected an object with sections such as imu"
             raise CalibrationError(f"{path}: {what}, not {json.dumps(values):.40}")
+        for fields, what, option in OTHER_FILES:
+            if fields <= values.keys():
+                raise CalibrationError(f"{path}: is {what}, not a calibration; give it with {option}")
         return cls.parse(values, str(path))
+
+    def over(self, other: PartialCalibration) -> PartialCalibration:
+        """These fields, and those of another where these say nothing."""
+        return PartialCalibration(_over(other.values, self.values), f"{self.source}, else {other.source}")
 
     def fields(self) -> list[str]:
         """Paths of the fields that are given, such as ``dvl.mounting.translation_m``."""

@@ -45,6 +45,8 @@ NO_LABEL = -2
 NONE = -1
 LEAST_FRAMES = 3
 """Labelled frames from which a class is measured."""
+LEAST_FOR_ENDS = 40
+"""Tracks of which one lies beyond each end of the range that holds 95 %."""
 PRIOR_SHARE = 0.25
 """Standard deviation of what is fitted about the shipped model, as a share of it; of looks, of their logarithm."""
 
@@ -273,7 +275,7 @@ def estimate_confusion(
         across_bound_m=float(found.usual_m[1]),
         bound_power=found.power,
         height_bias_m=height_bias_m,
-        roughness=roughness_of_tracks(fits),
+        roughness=roughness_of_tracks(fits, shipped.roughness),
         report_interval_s=report_interval_s(
             error / found.sigmas_m(fits.bound_m), fits.track, fits.stamp_ns, shipped.report_interval_s
         ),
@@ -295,12 +297,14 @@ def trials_of(fits: LabelledFits) -> Ints:
     return np.append(np.full(len(tracks) - 1, tracks[:-1].sum()), tracks[-1])
 
 
-def roughness_of_tracks(fits: LabelledFits) -> tuple[float, float]:
-    """`Confusion.roughness`: the range of all but one in twenty tracks."""
+def roughness_of_tracks(fits: LabelledFits, before: tuple[float, float] | None = None) -> tuple[float, float]:
+    """`Confusion.roughness`: the range of all but one in twenty tracks; of fewer than forty the given one is in it."""
     beyond = fits.evidence[:, :, EVIDENCE.index("beyond")].mean(axis=1)
     means = [beyond[fits.track == track].mean() for track in np.unique(fits.track)]
     low, high = np.quantile(means, [0.025, 0.975]).tolist()
-    return low, high
+    if before is None or len(means) >= LEAST_FOR_ENDS:
+        return low, high
+    return min(low, before[0]), max(high, before[1])
 
 
 def without_height(fits: LabelledFits) -> tuple[float, Floats]:

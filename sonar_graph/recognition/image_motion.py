@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonar_graph.calibration import Calibration
+from sonar_graph.errors import CalibrationError
 from sonar_graph.images import SonarFrames, decibels
 from sonar_graph.measurements import NS_PER_S, Floats
 from sonar_graph.sonar import SLANT_PLANE, FloorView, SonarStep, with_lens
@@ -68,6 +69,11 @@ class FloorPicture:
 
     def __init__(self, ranges_m: Floats, azimuths_rad: Floats, view: FloorView) -> None:
         seen = view.floor_points(*(grid.ravel() for grid in np.meshgrid(ranges_m, azimuths_rad))) @ view.level_R_sonar.T
+        if np.isnan(seen).all():
+            raise CalibrationError(
+                f"the sonar is {view.height_m:.4g} m above the floor and sees nothing of it up to its range of "
+                f"{ranges_m.max():.4g} m: check floor.z_m and start.position_m (metres) and sonar.mounting (radians)"
+            )
         low, high = np.nanmin(seen[:, :2], axis=0), np.nanmax(seen[:, :2], axis=0)
         self.pixel_m = float(high[0] - low[0]) / PIXELS_AHEAD
         self.corner_m = low

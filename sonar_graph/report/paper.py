@@ -116,13 +116,16 @@ def _of_comparison(comparison: Comparison) -> tuple[list[PaperFigure], list[Tabl
 
 
 def _rules(comparison: Comparison) -> list[str]:
-    """The measuring rule of each score of the compact table, each once."""
+    """Rules by which the scores of the compact table are measured, each once; where they differ, with their runs."""
     rules = []
     labels = {row[0].text for row in score_table(comparison).rows}
     for column in compact_table(comparison).columns[1:]:
-        scores = (comparison.score_of(run.estimator, column.key) for run in comparison.runs)
-        heading = f"{column.over}, {column.heading}".removeprefix(", ")
-        rules += [f"{heading}: {rule}" for rule in dict.fromkeys(score.protocol for score in scores if score)]
+        heading, names = f"{column.over}, {column.heading}".removeprefix(", "), dict[str, list[str]]()
+        for run in comparison.runs:
+            if score := comparison.score_of(run.estimator, column.key):
+                names.setdefault(score.protocol, []).append(run.estimator)
+        of = {rule: f" of {' and '.join(runs)}" if len(names) > 1 else "" for rule, runs in names.items()}
+        rules += [f"{heading}{of[rule]}: {rule}" for rule in names]
     return rules if labels else []
 
 

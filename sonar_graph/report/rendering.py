@@ -76,10 +76,12 @@ def write_tables(tables: list[Table], folder: Path) -> list[Path]:
 
 
 def as_csv(table: Table) -> str:
-    """Numbers in full and in the units of the results; empty where there is none."""
-    rows = [[f"{column.key}_{part}" if part else column.key for column in table.columns for part in column.parts]]
-    for row in table.rows:
-        texts: list[str] = []
+    """Numbers in full and in the units of the results; empty where there is none. Sections are a first column."""
+    head = [f"{column.key}_{part}" if part else column.key for column in table.columns for part in column.parts]
+    rows, section = [["section", *head] if table.sections else head], ""
+    for place, row in enumerate(table.rows):
+        section = table.sections.get(place, section)
+        texts = [section] if table.sections else []
         for column, cell in zip(table.columns, row, strict=True):
             for value in [*cell.numbers, *[math.nan] * (len(column.parts) - len(cell.numbers))]:
                 if isinstance(value, float):
@@ -119,7 +121,12 @@ def as_latex(table: Table) -> str:
                 rules.append(rf"\cmidrule(lr){{{first}-{first + width - 1}}}")
             first += width
         above = [" & ".join(cells) + r" \\", "".join(rules)]
-    rows = [[f"{cell.text} ({cell.note})" if cell.note else cell.text for cell in row] for row in table.rows]
+    rows = []
+    for place, row in enumerate(table.rows):
+        if place in table.sections:
+            rows.append(rf"\multicolumn{{{len(row)}}}{{l}}{{\textit{{{latex_text(table.sections[place])}}}}} \\")
+        texts = [f"{cell.text} ({cell.note})" if cell.note else cell.text for cell in row]
+        rows.append(" & ".join(map(latex_text, texts)) + r" \\")
     lines = [
         r"% \usepackage{booktabs,textcomp}",
         r"\begin{table}",
@@ -131,7 +138,7 @@ def as_latex(table: Table) -> str:
         *above,
         " & ".join(latex_text(column.heading) for column in table.columns) + r" \\",
         r"\midrule",
-        *(" & ".join(map(latex_text, row)) + r" \\" for row in rows),
+        *rows,
         r"\bottomrule",
         r"\end{tabular}",
         r"\end{table}",

@@ -18,6 +18,7 @@ from sonar_graph.evaluation import (
     MOST_ROWS_NAMED,
     Comparison,
     RefusedRows,
+    Score,
     gathered,
     headline_metric,
     label,
@@ -98,7 +99,7 @@ def finding(comparison: Comparison) -> list[str]:
             improved.append(f"{name} {smoothed.with_unit}")
         scores = {what: score for what, key in CONSISTENCY_KEYS.items() if (score := comparison.score_of(name, key))}
         if scores:
-            what = max(scores, key=lambda what: abs(math.log(max(scores[what].value, math.ulp(0.0)))))
+            what = max(scores, key=lambda what: _doubt(scores[what]))
             said = [what, scores[what].verdict]
             if (interval := scores[what].interval) is not None:
                 low, high = map(scores[what].text, interval)
@@ -113,10 +114,16 @@ def finding(comparison: Comparison) -> list[str]:
         sentences.append(f"Looking back from the end of the run (smoothed): {', '.join(improved)}.")
     if judged:
         sentences.append(
-            "NEES, of position or yaw whichever is further from the 1 of a fitting uncertainty, with what 95 % of "
+            "NEES, of position or yaw whichever is the more doubtful (1: a fitting uncertainty), with what 95 % of "
             f"consistent runs with as many independent samples have: {', '.join(judged)}."
         )
     return sentences
+
+
+def _doubt(score: Score) -> tuple[int, float]:
+    """Rank of a NEES by its doubtfulness: over-confident, over-cautious, within its interval; then by its logarithm."""
+    rank = ("over-cautious", "over-confident").index(score.verdict) + 1 if score.verdict.startswith("over") else 0
+    return rank, abs(math.log(max(score.value, math.ulp(0.0))))
 
 
 def headline(comparison: Comparison) -> str:
@@ -146,7 +153,11 @@ def headline(comparison: Comparison) -> str:
         return f"{opening}; its covariances are {told} (NEES {listed}, 1 fits)."
     if any(score.verdict for score in judged.values()):
         return f"{opening}; its covariances fit its errors."
-    return f"{opening}; whether its covariances fit, so short a run does not tell." if judged else f"{opening}."
+    return (
+        f"{opening}; whether its covariances fit, one run with so few independent samples does not tell."
+        if judged
+        else f"{opening}."
+    )
 
 
 def _map_sentence(comparison: Comparison) -> str:
@@ -161,8 +172,9 @@ def _map_sentence(comparison: Comparison) -> str:
 def no_detections(comparison: Comparison) -> str:
     """The sentence about the drift of a log, or of the chosen part of it, without detections."""
     part = comparison.sequence.notes.get("log.part")
-    if comparison.sequence.heading is not None or comparison.sequence.positions is not None:
-        return "The log has no landmark detections; only its headings and position fixes limit the drift."
+    aids = {"headings": comparison.sequence.heading, "position fixes": comparison.sequence.positions}
+    if there := " and ".join(name for name, block in aids.items() if block is not None):
+        return f"The log has no landmark detections; only its {there} limit the drift."
     if not part:
         return NO_DETECTIONS
     return f"The part of the log that was chosen ({part}) has no landmark detections; nothing corrects the drift in it."

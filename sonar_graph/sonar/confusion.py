@@ -127,9 +127,12 @@ class Confusion(Section):
         CalibrationError
             Naming the source and the first design that differs.
         """
-        ids, remedy = tuple(design.id for design in designs), "measure a model for these with sonar-graph calibrate"
+        ids = tuple(design.id for design in designs)
+        remedy = "give the designs of the model with --designs, or measure one for these with sonar-graph calibrate"
         if self.ids != ids:
-            raise CalibrationError(f"{source}: measured for landmarks {self.ids}, the designs are {ids}; {remedy}")
+            raise CalibrationError(
+                f"{source}: measured for landmarks {_listed(self.ids)}, the designs are {_listed(ids)}; {remedy}"
+            )
         if not self.designs:
             raise CalibrationError(f"{source}: designs: is missing, so that it may be of other landmarks; {remedy}")
         for mark, design in zip(self.designs, designs, strict=True):
@@ -160,6 +163,10 @@ class Confusion(Section):
         covariances = np.zeros((len(bound_m), 2, 2))
         covariances[:, [0, 1], [0, 1]] = sigmas**2
         return covariances
+
+
+def _listed(ids: Sequence[int]) -> str:
+    return ", ".join(map(str, ids))
 
 
 def posterior_mean_rows(mean_scores: Floats, trials: Ints) -> Floats:

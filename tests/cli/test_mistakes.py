@@ -32,6 +32,10 @@ def files(lane, lane_log, basin_content, tmp_path_factory) -> Path:
     texts |= {"strange.toml": DESIGN.format(id=9, size_m=0.6, shape=BAR)}
     texts |= {"broken.toml": DESIGN.format(id=1, size_m=-1, shape=CIRCLE)}
     texts |= {"large.toml": DESIGN.format(id=4, size_m=2.0, shape=CIRCLE.replace("0.15", "1.0"))}
+    high = (
+        "[floor]\nz_m = -1700.0\nsigma_m = 0.1\n[start]\nposition_m = [0.0, 0.0, -700.0]\nrpy_rad = [0.0, 0.5, 0.0]\n"
+    )
+    texts |= {"millimetres.toml": high, "labels.json": '{"log": "lane.mcap", "labels": []}'}
     texts |= {"gyro.toml": "[imu]\ngyro_sigma = 1\n", "logs.toml": 'name = "x"\nreference = "isam2"\nlogs = 3\n'}
     texts |= {
         "late.toml": SUITE,
@@ -60,6 +64,11 @@ MISTAKES = {
     "compare basin.mcap -o out --estimators ,": "expected names such as",
     "compare basin.mcap -o out --estimators isam2,,mine": "a name is empty",
     "compare basin.mcap -o out --estimators isam2,isam2": "isam2 is named twice",
+    "recognise images.mcap -o out.mcap --calibration millimetres.toml": (
+        r"1000 m above the floor and sees nothing of it up to its range of .* \(metres\)"
+    ),
+    "recognise lane.mcap -o out.mcap --calibration strange.toml": "is a file of landmark designs, .*with --designs",
+    "recognise lane.mcap -o out.mcap --calibration labels.json": "is a file of labels, not a calibration; .*--labels",
     "compare basin.mcap -o out --rate-hz 0": "--rate-hz",
     "compare basin.mcap -o out --rate-hz inf": "--rate-hz",
     "compare basin.mcap -o out --rate-hz nan": "--rate-hz",

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from sonar_graph import write_log
+from sonar_graph import read_log, write_log
 from sonar_graph.cli.main import main
 from sonar_graph.simulation import MissionOptions, simulate_mission
 from tests.live.traffic import free_endpoint
@@ -61,7 +61,7 @@ def test_a_live_run_that_is_killed_and_resumed_equals_the_run_on_its_record(tmp_
     player = subprocess.Popen([*COMMAND, "play", tmp_path / "log.mcap", "--listen", where, "--after", go])
     time.sleep(3.0)
     try:
-        live = begun(tmp_path / "first", where)
+        live = begun(tmp_path / "first", where, "--calibration", str(tmp_path / "log.mcap"))
         go.touch()
         time.sleep(12.0)
         live.kill()
@@ -79,6 +79,9 @@ def test_a_live_run_that_is_killed_and_resumed_equals_the_run_on_its_record(tmp_
         mine, theirs = ((tmp_path / folder / "runs/isam2" / name).read_bytes() for folder in ("second", "again"))
         assert mine == theirs
         assert mine.count(b"\n") > 5
+    calibrations = [read_log(tmp_path / folder / "record.mcap").calibration for folder in ("first", "second")]
+    assert calibrations[0] == calibrations[1]
+    assert calibrations[1].start.position_m == world.calibration.start.position_m != (0.0, 0.0, 0.0)
 
 
 def begun(folder, where, *options):

@@ -362,3 +362,7 @@ def test_roughness_is_the_range_of_all_but_one_track_in_twenty_however_long_they
     fits.evidence[..., EVIDENCE.index("beyond")] = level[:, None]
     low, high = confusion_fit.roughness_of_tracks(some(fits, np.append(np.arange(201), [200] * 50)))
     assert [low, high] == pytest.approx([0.5, 19.5])
+    assert confusion_fit.roughness_of_tracks(some(fits, np.arange(201)), (-1.0, 99.0))[1] < 20
+    few = some(fits, np.arange(30, 36))  # three frames a track
+    assert len(np.unique(few.track)) < confusion_fit.LEAST_FOR_ENDS
+    assert confusion_fit.roughness_of_tracks(few, (0.5, 3.2)) == (0.5, pytest.approx(3.5, abs=0.2))

@@ -190,6 +190,17 @@ def test_every_run_is_listed_once_and_leads_to_its_log():
     assert {cell.link for cell in cells if cell.link} == {f"#{table.name}" for _, table in lists}
 
 
+def test_sections_of_a_table_stand_in_its_csv_and_latex():
+    """Of two scores of one name a paper must say which is causal."""
+    rows = [[Cell("RMSE"), Cell("1.0", (1.0,))], [Cell("RMSE"), Cell("0.5", (0.5,))]]
+    columns = [Column("metric", "Metric", is_number=False), Column("a", "a")]
+    table = Table("t", "Scores", "", columns, rows, {0: "Causal", 1: "Smoothed"})
+    assert [row["section"] for row in rows_of(table)] == ["Causal", "Smoothed"]
+    lines = as_latex(table).splitlines()
+    assert lines.index(r"\multicolumn{2}{l}{\textit{Causal}} \\") == lines.index(r"RMSE & 1.0 \\") - 1
+    assert lines.index(r"\multicolumn{2}{l}{\textit{Smoothed}} \\") == lines.index(r"RMSE & 0.5 \\") - 1
+
+
 def test_latex_has_as_many_cells_as_columns_in_every_row_and_takes_no_commands_from_names(tmp_path):
     table = tables.accuracy_table(with_failures(BATCH, "isam2", LOGS[0], 2), YAW)
     text = as_latex(table)

@@ -191,7 +191,15 @@ def test_finding_tells_another_smoothed_error_and_that_there_were_no_detections(
         sequence = replace(comparison.sequence, detections=None, notes=notes)
         assert sentences.finding(replace(comparison, sequence=sequence))[0].startswith(said)
     aided = replace(comparison.sequence, detections=None, heading=Heading(np.zeros(1, int), np.zeros(1), np.ones(1)))
-    assert "only its headings and position fixes" in sentences.finding(replace(comparison, sequence=aided))[0]
+    assert "only its headings limit" in sentences.finding(replace(comparison, sequence=aided))[0]
+
+
+def test_finding_gives_the_nees_that_is_not_to_be_believed_before_one_that_is_farther_from_1_but_within_its_interval():
+    comparison = basin_comparison(60, truth=True)
+    wrong, fine = (Score(v, "", "By hand.", better="inside", interval=(0.01, 2.0)) for v in (4.0, 0.05))
+    scores = {"isam2": comparison.scores["isam2"] | {"causal.nees_position": wrong, "causal.nees_yaw": fine}}
+    (said,) = [s for s in sentences.finding(replace(comparison, scores=comparison.scores | scores)) if "NEES" in s]
+    assert "isam2 4 (position, over-confident" in said
 
 
 def test_failures_come_first_and_the_lack_of_a_finding_has_its_reason():

@@ -68,7 +68,11 @@ def match_reference_to_imu(imu: Imu, reference: Trajectory, calibration: Calibra
         interval_s = max(float(np.median(np.diff(seconds[rows]))), 1e-9)
         rows = rows[:: max(1, int(np.ceil(LEAST_INTERVAL_S / interval_s - 1e-6)))]
     if sum(map(len, _stretches_of(path.parts_at(seconds[rows])))) < LEAST_ROWS - 1:
-        short = Estimate1D(np.nan, np.inf, f"less than {LEAST_ROWS} poses while the IMU runs without a hole")
+        short = Estimate1D(
+            np.nan,
+            np.inf,
+            f"less than {LEAST_ROWS} poses, {LEAST_INTERVAL_S:g} s apart, while the IMU runs without a hole",
+        )
         return ReferenceMatch(short, short)
     seconds, world_R_imu = seconds[rows], reference.rotations()[rows] * Rotation.from_matrix(body_R_imu)
 

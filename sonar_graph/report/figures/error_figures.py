@@ -33,7 +33,7 @@ def error_figure(comparison: Comparison) -> Figure | None:
     if not runs:
         return None
     series = [(index, comparison.errors[run.estimator]["causal"]) for index, run in runs]
-    labels = ["position error (m)", *(["yaw error (°)"] if _has_yaw(comparison) else [])]
+    labels = ["position error (m)", *(["yaw error (°)"] if has_yaw(comparison) else [])]
     figure, axes = style.blank_panels(
         len(labels), 2, style.size_in(len(labels)), sharex="col", sharey="row", width_ratios=[1.0, 1.0]
     )
@@ -92,7 +92,7 @@ def bounds_figure(comparison: Comparison) -> Figure | None:
     series = [comparison.errors[run.estimator]["causal"] for _, run in runs]
     axes_count = max(errors.position_dof for errors in series)
     labels = [f"error in {'xyz'[axis]} (m)" for axis in range(axes_count)]
-    labels += ["yaw error (°)"] if _has_yaw(comparison) else []
+    labels += ["yaw error (°)"] if has_yaw(comparison) else []
     figure, axes = style.blank_panels(
         len(labels), len(runs), style.size_in(len(labels), 1.45), sharex=True, sharey="row"
     )
@@ -211,7 +211,7 @@ def _runs_with_errors(comparison: Comparison) -> list[tuple[int, RunResult]]:
     ]
 
 
-def _has_yaw(comparison: Comparison) -> bool:
+def has_yaw(comparison: Comparison) -> bool:
     """True where a run has errors of heading."""
     series = (comparison.errors[run.estimator]["causal"] for _, run in _runs_with_errors(comparison))
     return any(np.isfinite(errors.yaw_rad).any() for errors in series)

@@ -36,7 +36,7 @@ DRAWINGS = {
     "errors": Drawing(
         "Error over time and distance",
         error_figures.error_figure,
-        "Horizontal distance of the causal position from the truth, and size of the causal heading's error, "
+        "Horizontal distance of the causal position from the truth{and_heading}, "
         "{unaligned}. Left: over time; right: over the distance that the truth has travelled.{cut}",
         "{no_errors}",
         ("causal.ate_raw_m", "causal.yaw_rmse_rad"),
@@ -164,7 +164,11 @@ def _captions(comparison: Comparison) -> dict[str, str]:
             f"paths are drawn where they differ.{_leaving(gone)}"
         ),
         "growth": growth,
-        "errors": DRAWINGS["errors"].caption.format(unaligned=world, cut=_leaving(far)),
+        "errors": DRAWINGS["errors"].caption.format(
+            unaligned=world,
+            and_heading=", and size of the causal heading's error" if error_figures.has_yaw(comparison) else "",
+            cut=_leaving(far),
+        ),
         "bounds": DRAWINGS["bounds"].caption.format(unaligned=world),
         "yaw": f"Heading of the body's x axis, wrapped to ±180°, causal.{counterpart.format('Fig. 5')}",
     }
