@@ -56,7 +56,7 @@ class LabelledFits:
     """Fits of designs to patches whose class is known."""
 
     evidence: Floats
-    """For each design, in the columns of `EVIDENCE`, shape (n, ids, 9)."""
+    """For each design, in the columns of `EVIDENCE`, shape (n, ids, 11)."""
     bound_m: Floats
     """`ObjectSighting.bound_m`, shape (n, 2)."""
     label: Ints
@@ -205,7 +205,7 @@ def calibrate(
     Raises
     ------
     CalibrationError
-        When a log has no truth, has none of the landmarks, or a landmark was seen too rarely.
+        When a log has no truth, has none of the landmarks, or too few frames of landmarks or of what is none.
     LogError
         When a log has no images, or they cannot be read.
     """
@@ -251,8 +251,9 @@ def estimate_confusion(
     is_known = counts >= LEAST_FRAMES
     poor = [f"{name}: {count}" for name, count in zip(names, counts.tolist(), strict=True) if count < LEAST_FRAMES]
     if not is_known[-1] or not is_known[:-1].any() or (poor and not designs):
+        needed = f"{LEAST_FRAMES} of a landmark, and of what is none"
         raise CalibrationError(
-            f"too few labelled frames ({'; '.join(poor)}; needed {LEAST_FRAMES} of each): give longer or more logs"
+            f"too few labelled frames ({'; '.join(poor)}; needed {needed}): give longer or more logs"
         )
     shipped = read_confusion(SHIPPED)
     weights, looks = fit_weights(fits, np.array(shipped.weights), shipped.looks)
@@ -280,7 +281,7 @@ def estimate_confusion(
             error / found.sigmas_m(fits.bound_m), fits.track, fits.stamp_ns, shipped.report_interval_s
         ),
         provenance=provenance
-        | ({"confusion matrix": f"as without calibration for {', '.join(poor)} frames"} if poor else {})
+        | ({"confusion matrix": f"as without calibration, for want of frames, in the rows of {', '.join(poor)}"} if poor else {})
         | {f"frames of {n}": str(c) for n, c in zip(names, counts.tolist(), strict=True)}
         | {f"tracks of {n}": str(c) for n, c in zip(names, tracks_of(fits).tolist(), strict=True)},
     )
@@ -333,13 +334,13 @@ def accuracy(
     """Usual bounds along the ray and across, their sigmas there, and the power of the bound, as `Confusion` has them.
 
     The most probable ones for normal errors of which each track counts once, with a normal prior about the power of the
-    given accuracy (`PRIOR_SHARE`) and limits. The usual bound is the geometric mean. Variances are those of n tracks of
-    which one is lost to the height: errors of a track repeat, and the height was fitted to these tracks. The variances
-    of the given accuracy count as ``1 / (2 PRIOR_SHARE^2)`` tracks, whose sigma is known to `PRIOR_SHARE` of itself.
+    given accuracy (`PRIOR_SHARE`) and limits. The usual bound is the geometric mean. Errors of a track repeat, so that
+    n tracks are as many samples, one of which is lost to the height for the range. The variances of the given accuracy
+    count as ``1 / (2 PRIOR_SHARE^2)`` further ones, from which a sigma is known to `PRIOR_SHARE` of itself.
     """
     known = np.isfinite(error).all(axis=1) & np.isfinite(bound).all(axis=1)
     error, bound, (_, track) = error[known], bound[known], np.unique(track_of[known], return_inverse=True)
-    once, tracks = 1.0 / np.bincount(track)[track], max(int(track.max()) + 1, 2)
+    once, tracks = 1.0 / np.bincount(track)[track], int(track.max()) + 1
     usual = np.exp(np.average(np.log(bound), axis=0, weights=once))
     growth, tiny = np.log(bound / usual), np.finfo(float).tiny
 
@@ -351,11 +352,11 @@ def accuracy(
         return float(0.5 * off**2 + 0.5 * tracks * np.log(np.maximum(variances(power), tiny)).sum())
 
     power = float(minimize_scalar(loss, bounds=powers, method="bounded").x)
-    variance = variances(power) * tracks / (tracks - 1)
+    squares, samples = tracks * variances(power), np.array([tracks - 1.0, tracks])
     if prior:
         before = 1 / (2 * PRIOR_SHARE**2)
-        variance = (tracks * variance + before * prior.sigmas_m(usual) ** 2) / (tracks + before)
-    return Accuracy(usual, np.sqrt(variance), power)
+        squares, samples = squares + before * prior.sigmas_m(usual) ** 2, samples + before
+    return Accuracy(usual, np.sqrt(squares / np.maximum(samples, 1.0)), power)
 
 
 def report_interval_s(error: Floats, track_of: Ints, stamp_ns: Ints, prior_s: float) -> float:

@@ -16,6 +16,8 @@ GRAVITY_INTERVAL_NS = NS_PER_S
 """Shortest time over which accelerometers are averaged; the noise of velocity at its ends falls with its square."""
 KEPT_NS = 60 * NS_PER_S
 """Rows of a live run that are kept before the last frame, for a sensor that is late."""
+KNOWN_HEIGHT_M = 0.1
+"""Sigma of a start's height up to which it tells where the floor is, before the first depth sample."""
 _NO_BIAS = np.zeros(3)
 
 
@@ -67,6 +69,8 @@ class _Height:
         self._default = sequence.calibration.depth.sigma_m**2
         start = sequence.calibration.start
         self.z_m, self.variance = start.position_m[2], start.position_sigma_m[2] ** 2
+        self.is_measured = depth is not None and start.position_sigma_m[2] <= KNOWN_HEIGHT_M
+        """True from the first depth sample that corrected it, or with depth and a start whose height is known."""
         self._stamp_ns = sequence.start_ns
 
     def carry(self, climbed_m: float, variance_m2: float) -> None:
@@ -86,6 +90,7 @@ class _Height:
         self._stamp_ns = until_ns
         if rows is None:
             return
+        self.is_measured = True
         variances = np.where(np.isnan(rows.variance_m2), self._default, rows.variance_m2)
         z_m = float(rows.z_m[-1] - up @ self._port)
         gain = self.variance / (self.variance + float(variances[-1]))
@@ -103,7 +108,6 @@ class SonarMotions:
         self._tilt = _Tilt(sequence, self._odometry)
         self._height = _Height(sequence.depth, sequence)
         self._floor = calibration.floor
-        self._has_depth = sequence.depth is not None
         self._body_T_sonar = calibration.sonar.mounting.pose()
         self._start_ns, self._end_ns = sequence.start_ns, sequence.end_ns
         self._stamp_ns = sequence.start_ns
@@ -116,7 +120,6 @@ class SonarMotions:
             self._end_ns = max(self._end_ns, int(imu.stamps_ns[-1]))
         if depth is not None:
             self._height.add(depth)
-            self._has_depth = True
         settled_ns = min(self._stamp_ns, self._tilt.epoch_ns)
         if settled_ns > self._start_ns + KEPT_NS:
             self._odometry.forget_before(settled_ns - KEPT_NS)
@@ -147,7 +150,7 @@ class SonarMotions:
             previous_T_sonar = sonar_T_body.compose(motion.i_T_j).compose(self._body_T_sonar)
             step = SonarStep(previous_T_sonar, adjoint @ motion.covariance @ adjoint.T)
         self._stamp_ns, self._is_first = stamp_ns, False
-        if self._floor is not None and self._has_depth:
+        if self._floor is not None and self._height.is_measured:
             height_m = float(self._height.z_m + up @ self._body_T_sonar.translation() - self._floor.z_m)
             if height_m > 0:
                 level_R_sonar = level_from_up(self._body_T_sonar.rotation().matrix().T @ up)

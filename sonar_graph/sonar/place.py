@@ -51,7 +51,7 @@ class Relief(NamedTuple):
         """A design at this heading against the direction away from the sonar, which is the grid's x axis."""
         of_bright, power = echo_power(design, heading_rad, side, cell_m)
         is_bright = power > 1
-        width = round(SIDE_M / cell_m * FINE)
+        width = max(1, round(SIDE_M / cell_m * FINE))
         shaded, raised_power = is_bright.copy(), with_side(power, width)
         bright, whole, raised = (seen_db(one, cell_m, blur_m) for one in (of_bright, power, raised_power))
         for _ in range(shade_steps * SHADE_FINE):

@@ -259,7 +259,7 @@ def test_a_design_that_was_not_seen_keeps_the_row_of_no_calibration_and_moves_no
     assert model.matrix[1] == confusion_for((first, second)).matrix[1] != alone.matrix[1]
     assert model.matrix[0][0] == pytest.approx(alone.matrix[0][0], abs=0.05)
     assert model.range_sigma_m == pytest.approx(alone.range_sigma_m, rel=0.2)
-    assert model.provenance["confusion matrix"] == "as without calibration for landmark 2: 0 frames"
+    assert model.provenance["confusion matrix"] == "as without calibration, for want of frames, in the rows of landmark 2: 0"
     assert "confusion matrix" not in alone.provenance
     for label in (0, 2):
         only = some(fits, np.flatnonzero(fits.label == label))
@@ -274,10 +274,10 @@ def test_sigmas_are_root_mean_squares_at_the_usual_bound():
     model = confusion_fit.estimate_confusion(off, (1, 2), {})
     sigmas = np.hypot([0.03, 0.005], [0.01, 0.002])
     assert [model.range_sigma_m, model.across_sigma_m] == pytest.approx(sigmas, rel=0.05)
-    variances = np.nanmean(off.error_m**2, axis=0) * 600 / 599
+    squares = np.nansum(off.error_m**2, axis=0)  # of 600 tracks, one of which is lost to the height
     before = np.diag(PRIOR.range_azimuth_cov(BOUND[None], np.ones(1))[0])  # counts as eight tracks
     np.testing.assert_allclose(
-        np.diag(model.range_azimuth_cov(BOUND[None], np.ones(1))[0]), (600 * variances + 8 * before) / 608, rtol=1e-9
+        np.diag(model.range_azimuth_cov(BOUND[None], np.ones(1))[0]), (squares + 8 * before) / [607, 608], rtol=1e-9
     )
 
 
@@ -289,7 +289,7 @@ def test_a_few_tracks_move_the_sigmas_little_and_many_more():
         error = 3 * sigma * rng.choice([-1.0, 1.0], (tracks, 2))
         found = confusion_fit.accuracy(error, np.tile(BOUND, (tracks, 1)), np.arange(tracks), prior)
         times.append(found.usual_sigmas_m / sigma)
-    np.testing.assert_allclose(times[0], np.sqrt((4 * 9 * 4 / 3 + 8) / 12))
+    np.testing.assert_allclose(times[0], np.sqrt((4 * 9 + 8) / np.array([11, 12])))
     np.testing.assert_allclose(times[1], 3, rtol=0.02)
 
 
@@ -318,7 +318,7 @@ def test_a_track_counts_once_for_the_accuracy_however_long_it_is_watched():
     """One track errs by 1 cm for 100 frames, another one by 3 cm for one."""
     error = np.array([[0.01, 0.001]] * 100 + [[0.03, 0.003]])
     _, sigmas, _ = confusion_fit.accuracy(error, np.tile(BOUND, (101, 1)), np.arange(101) // 100)
-    np.testing.assert_allclose(sigmas**2, [2 * 5e-4, 2 * 5e-6])  # n - 1 of two tracks
+    np.testing.assert_allclose(sigmas**2, [2 * 5e-4, 5e-6])  # in range one of two tracks is lost to the height
 
 
 def test_frames_of_a_track_count_together():

@@ -259,6 +259,23 @@ def test_depth_that_begins_after_the_images_gives_the_view_from_then_on(exact):
         np.testing.assert_allclose(found.level_R_sonar, whole.level_R_sonar, atol=1e-9)
 
 
+@pytest.mark.parametrize("is_live", [True, False])
+def test_depth_gives_no_view_before_its_first_sample_where_the_start_is_at_an_unknown_height(exact, is_live):
+    """A recogniser that is behind its images has rows from the future, and a log has all; the height is off by 1 m."""
+    start = exact.calibration.start
+    wrong = (*start.position_m[:2], start.position_m[2] + 1.0)
+    unknown = start.model_copy(update={"position_m": wrong, "position_sigma_m": (0.01, 0.01, 1.0)})
+    stamps_ns, calibration = frames_of(exact, 4), exact.calibration.model_copy(update={"start": unknown})
+    depth = exact.depth.between(stamps_ns[1], exact.end_ns)
+    motions = SonarMotions(replace(exact, calibration=calibration, depth=None if is_live else depth))
+    if is_live:
+        motions.extend(None, None, depth)
+    heights = [view and view.height_m for view in (motions.at(stamp_ns)[1] for stamp_ns in stamps_ns)]
+    assert heights[:2] == [None, None]
+    for found, whole in zip(heights[2:], along(exact, stamps_ns)[1][2:], strict=True):
+        assert found == pytest.approx(whole.height_m, abs=0.02)
+
+
 def test_only_instants_with_odometry_and_in_order_are_covered(exact):
     motions, stamps_ns = SonarMotions(exact), frames_of(exact, 3)
     ends_ns = [exact.start_ns - 1, exact.start_ns, exact.end_ns, exact.end_ns + 1]

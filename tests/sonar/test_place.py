@@ -12,7 +12,7 @@ from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.images import SonarFrames
 from sonar_graph.measurements import Floats
 from sonar_graph.simulation.sonar_image import FrameSimulator, ImageOptions, place_landmark
-from sonar_graph.sonar.appearance import Appearance, AppearanceParams, CandidateFit
+from sonar_graph.sonar.appearance import Appearance, AppearanceParams, CandidateFit, DesignFit
 from sonar_graph.sonar.confusion import confusion_for
 from sonar_graph.sonar.geometry import FloorView
 from sonar_graph.sonar.place import Relief
@@ -179,3 +179,36 @@ def test_foam_that_stands_up_is_ranged_without_bias_and_nearer_where_its_relief_
     known, unknown = (range_errors_m(disc, one) for one in (disc, replace(disc, relief_m=0.0)))
     assert abs(known.mean()) < 0.002
     assert unknown.mean() < known.mean() - 0.003
+
+
+@pytest.mark.parametrize("slope", [0.15, 0.6, 1.2])
+@pytest.mark.parametrize("design", [0, 2])
+def test_side_and_shadow_of_a_place_are_those_of_the_slope_at_which_the_sonar_looks(slope: float, design: int):
+    """``t h / d`` of the face and ``t (d / h + h / d)`` behind it of 12 mm of foam: nothing is left, the bound is 0.
+
+    In the same appearance after each other, so that what was drawn for one slope is not taken for another.
+    """
+    relief_m, heading_rad = 0.012, 0.3
+    tall = replace(DEFAULT_DESIGNS[design], relief_m=relief_m)
+    appearance = Appearance([tall], BLUR_M)
+    rows = np.flatnonzero(appearance.templates.design == 0)
+    row = rows[np.abs(np.angle(np.exp(1j * (appearance.templates.heading_rad[rows] - heading_rad)))).argmin()]
+    heading_rad, side, cell_m = float(appearance.templates.heading_rad[row]), appearance.templates.side, CELL_M
+    for other in (0.9, slope):
+        length = relief_m * (other + 1 / other) / (cell_m / 2)
+        steps = int(length)
+        drawn_now = Relief.of(tall, heading_rad, side, cell_m, BLUR_M, steps)
+        shade = drawn_now.shades[0] + (length - steps) * (drawn_now.shades[1] - drawn_now.shades[0])
+        face = drawn_now.figure + relief_m * other * drawn_now.side
+        level = np.full((appearance.patch_side, appearance.patch_side), 40.0)
+        inset = (appearance.patch_side - side) // 2 + np.array([1, -2])
+        inside = tuple(slice(first, first + side) for first in inset)
+        level[inside] += 0.7 * face + 0.5 * drawn_now.dark * (1 - shade) - 9.0 * shade
+        seen = np.ones_like(level, dtype=np.float32)
+        centre_m = np.array([2.0, 0.1])
+        patch = Patch(level.astype(np.float32), seen, level.astype(np.float32), seen, centre_m)
+        at = centre_m + cell_m * np.array([1, -2])
+        fit = DesignFit(np.zeros((1, 11)), 1.0, np.array([heading_rad]), at[None] + 0.004, np.array([row]))
+        place_m, bound_m = appearance.place(patch, fit, 0, other)
+        np.testing.assert_allclose(place_m, at, atol=2e-5)
+        assert (bound_m < 2e-5).all()
