@@ -295,7 +295,7 @@ def calibrate(
             "give more logs before the model is relied on"
         )
     if assumed := measured.provenance.get("confusion matrix"):
-        answers().print(f"Confusion matrix: {assumed}; the rule of 2014 alone uses it")
+        answers().print(f"Confusion matrix, which the rule of 2014 alone uses: {assumed}")
     echo(f"Model: {path}")
 
 

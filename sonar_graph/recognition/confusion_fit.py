@@ -281,7 +281,7 @@ def estimate_confusion(
             error / found.sigmas_m(fits.bound_m), fits.track, fits.stamp_ns, shipped.report_interval_s
         ),
         provenance=provenance
-        | ({"confusion matrix": f"as without calibration, for want of frames, in the rows of {', '.join(poor)}"} if poor else {})
+        | ({"confusion matrix": f"too few frames, so as without calibration: {', '.join(poor)}"} if poor else {})
         | {f"frames of {n}": str(c) for n, c in zip(names, counts.tolist(), strict=True)}
         | {f"tracks of {n}": str(c) for n, c in zip(names, tracks_of(fits).tolist(), strict=True)},
     )

@@ -259,7 +259,7 @@ def test_a_design_that_was_not_seen_keeps_the_row_of_no_calibration_and_moves_no
     assert model.matrix[1] == confusion_for((first, second)).matrix[1] != alone.matrix[1]
     assert model.matrix[0][0] == pytest.approx(alone.matrix[0][0], abs=0.05)
     assert model.range_sigma_m == pytest.approx(alone.range_sigma_m, rel=0.2)
-    assert model.provenance["confusion matrix"] == "as without calibration, for want of frames, in the rows of landmark 2: 0"
+    assert model.provenance["confusion matrix"] == "too few frames, so as without calibration: landmark 2: 0"
     assert "confusion matrix" not in alone.provenance
     for label in (0, 2):
         only = some(fits, np.flatnonzero(fits.label == label))
