@@ -9,6 +9,7 @@ import pytest
 from gtsam.symbol_shorthand import L, X
 from scipy.stats import multivariate_normal
 
+from sonar_graph import run_estimator
 from sonar_graph.calibration import FloorPrior, SonarCalibration
 from sonar_graph.measurements import Floats
 from sonar_graph.slam import GaussianKernel, KeyframeParams, MixtureIdentity, RobustIdentity, RobustKernel
@@ -17,10 +18,11 @@ from sonar_graph.slam.landmarks import mixture_policy as doubtful_identities
 from sonar_graph.slam.landmarks.landmark_graph import AmendableJournal, Assignment, LandmarkGraph
 from sonar_graph.slam.landmarks.mixture import Choices, IdentityPosterior, Mixture, RecogniserErrors, TrackedObject
 from sonar_graph.slam.landmarks.mixture_policy import MixtureIdentities
-from sonar_graph.slam.landmarks.sighting import Sighting, SightingFactors
+from sonar_graph.slam.landmarks.sighting import SeenFrame, Sighting, SightingFactors
 from sonar_graph.slam.models import Kernel
 from sonar_graph.slam.smoother.batch_solution import Sightline
 from sonar_graph.states import Outcome
+from sonar_graph.testing import misnamed_world
 
 from . import dive as dive_module
 from . import test_mixture as small
@@ -384,3 +386,18 @@ def test_the_choices_that_settle_are_the_cheapest_of_all(said: list[int]) -> Non
     for other in [others[k] for k in rng.choice(len(others), 60, replace=False)]:
         worse = policy._solve(KNOWN, policy.watches, start, other)
         assert cost_of(policy, worse, other) > cost_of(policy, found.values, places) + 1.0
+
+
+@pytest.mark.parametrize("rivals", [1, 2])
+def test_far_landmarks_that_nobody_names_change_no_choice(rivals: int, monkeypatch):
+    """Of a map of more than `MOST_RIVALS` landmarks only the nearest are asked for; here of three, one or two."""
+    world, settings = misnamed_world(), {"identity.policy": "max-mixture", "identity.wrong_id_probability": 0.2}
+    whole = run_estimator(world, "isam2", settings)
+    asked: list[int] = []
+    predict = SeenFrame.predict
+    monkeypatch.setattr(SeenFrame, "predict", lambda frame, keys: asked.append(len(keys)) or predict(frame, keys))
+    monkeypatch.setattr(doubtful_identities, "MOST_RIVALS", rivals)
+    nearest = run_estimator(world, "isam2", settings)
+    assert 0 in asked, "no frame came when there were more landmarks"
+    np.testing.assert_allclose(nearest.causal.positions, whole.causal.positions, atol=1e-9)
+    assert nearest.landmarks.ids.tolist() == whole.landmarks.ids.tolist()

@@ -33,7 +33,7 @@ from sonar_graph.slam.landmarks.mixture import (
     each_once,
     supporters_elsewhere,
 )
-from sonar_graph.slam.landmarks.sighting import Screened, SeenFrame, Sighting, late_view
+from sonar_graph.slam.landmarks.sighting import Screened, SeenFrame, Sighting, beam_point, late_view
 from sonar_graph.slam.landmarks.tracked import NS_PER_S, GatedIdentity, RobustIdentity, second_rows_of_tracks
 from sonar_graph.slam.models import Kernel
 from sonar_graph.slam.smoother import Marginals, solve_in_sight
@@ -44,6 +44,9 @@ MOST_WINDOW_ROUNDS, MOST_HISTORY_ROUNDS = 3, 10
 """Times that choices are made anew, after one update and for one smoothed result."""
 MOST_OPEN = 200
 """Number of newest tracked objects that are chosen anew in the window."""
+MOST_RIVALS = 50
+"""Number of landmarks nearest to a detection among which it is weighed, beside those that it names. The cost of their
+joint covariance grows with the third power of their number."""
 
 
 class MixtureIdentity(RecogniserErrors):
@@ -109,7 +112,7 @@ class MixtureIdentities:
         """
         rows, tracks = list(range(len(frame.rows))), frame.detections.track.tolist()
         statements = [IdentityPosterior.of(frame.detections, row) for row in rows]
-        ids = self._landmarks.ids
+        ids = self._rivals(frame, statements)
         keys = [L(i) for i in ids]
         view = frame.predict(keys)
         points = np.array([self._smoother.values.atPoint3(key) for key in keys]).reshape(-1, 3)
@@ -228,6 +231,21 @@ class MixtureIdentities:
             and all(s.line.pose_key in inside for s in watch.sightings)
             and watch not in contradicted
         ]
+
+    def _rivals(self, frame: SeenFrame, statements: list[IdentityPosterior]) -> list[int]:
+        """Landmarks among which the detections of a frame are weighed, ascending; see `MOST_RIVALS`."""
+        ids = self._landmarks.ids
+        if len(ids) <= MOST_RIVALS:
+            return ids
+        world_T_sonar = frame.predict([]).world_T_sonar
+        seen = np.array([beam_point(world_T_sonar, z)[:2] for z in frame.z])
+        points = np.array([self._smoother.values.atPoint3(L(i))[:2] for i in ids])
+        away_m = np.linalg.norm(points - seen[:, None], axis=2)
+        near = np.argpartition(away_m, MOST_RIVALS - 1, axis=1)[:, :MOST_RIVALS]
+        kept = {ids[k] for k in np.unique(near).tolist()}
+        kept.update(i for statement in statements for i in statement.probability)
+        kept.update(w.landmark_id for w in self._tracks.values() if w.landmark_id is not None)
+        return [i for i in ids if i in kept]
 
     def _is_alone(self, watch: TrackedObject) -> bool:
         """True when no other object has sightings of its landmark."""
