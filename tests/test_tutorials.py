@@ -177,7 +177,7 @@ def test_page_on_recordings_has_a_calibration_and_labels_that_are_read(tmp_path)
     page = (TUTORIALS / "09_from_a_recording.md").read_text(encoding="utf-8")
     (tmp_path / "over.toml").write_text(textwrap.dedent(re.search(r"```toml\n(.*?)```", page, re.DOTALL)[1]))
     assert "floor.z_m" in PartialCalibration.read(tmp_path / "over.toml").fields()
-    assert f'Of every landmark and of "none of them" {LEAST_FRAMES} labelled frames are needed' in page
+    assert f'Of one landmark and of "none of them" {LEAST_FRAMES} labelled frames are needed' in page
     (labels,) = blocks(page, "csv")
     (tmp_path / "labels.csv").write_text(labels)
     assert [label.id for label in read_labels(tmp_path / "labels.csv", Path("joined.mcap")).labels] == [1, None]

@@ -81,7 +81,7 @@ def live(
         open_outlets,
         recorded_messages,
     )
-    from sonar_graph.logs import LiveRecord, read_log, resumed_calibration
+    from sonar_graph.logs import LiveRecord, read_log
 
     reading = ReadingOptions(calibration, topics, log_config)
     record = output / RECORD
@@ -90,7 +90,7 @@ def live(
         raise LogError(f"{record}: a record is there already: {advice}")
     overrides = estimator_settings(settings, [estimator]).get(estimator, {})
     params = check_request(estimator, overrides)
-    given = reading.given if resume is None else resumed_calibration(resume, reading.given)
+    given = reading.given if resume is None else LiveRecord.resumed_calibration(resume, reading.given)
     options = LiveOptions(estimator, overrides, rate_hz, lateness, reading.choices, reading.config, given)
     with open_link(connect or [DEFAULT_ROUTER], domain) as link, interrupt_event() as ended:
         output.mkdir(parents=True, exist_ok=True)

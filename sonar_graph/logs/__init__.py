@@ -7,9 +7,7 @@ from sonar_graph import at_first_use
 if TYPE_CHECKING:
     from sonar_graph.logs.amending import Amended, write_amended
     from sonar_graph.logs.inspection import LogSummary, TopicSummary, inspect_log
-    from sonar_graph.logs.live_record import (
-    DROPPED_TOPIC, LATENESS, LIVE_RATE, LiveRecord, dropped_in, pinned, resumed_calibration,
-)
+    from sonar_graph.logs.live_record import DROPPED_TOPIC, LATENESS, LIVE_RATE, LiveRecord, dropped_in, pinned
     from sonar_graph.logs.reading import Assembly, read_log, rows_of
     from sonar_graph.logs.result_log import write_result
     from sonar_graph.logs.roles import DETECTIONS, ROLES, Choice, choose_each, choose_topics, wanted_types
@@ -26,8 +24,7 @@ __all__ = [
     "Amended", "Assembly", "Choice", "DETECTIONS", "DROPPED_TOPIC", "ImagesAlone", "LATENESS", "LIVE_RATE",
     "LiveRecord", "LogSummary", "METADATA", "PICTURES", "PartialCalibration", "Picture", "ROLES", "TopicSummary",
     "choose_each", "choose_topics", "detection_messages", "dropped_in", "inspect_log", "joined_calibration",
-    "lacking_navigation", "landmark_map_message", "landmark_markers", "no_images", "pinned",
-    "read_images_alone", "read_log", "read_sonar_frames", "resumed_calibration", "rows_of", "sonar_frame",
-    "sonar_image_messages", "wanted_types", "with_notes", "write_amended", "write_landmarks_csv", "write_log",
-    "write_result", "write_tum",
+    "lacking_navigation", "landmark_map_message", "landmark_markers", "no_images", "pinned", "read_images_alone",
+    "read_log", "read_sonar_frames", "rows_of", "sonar_frame", "sonar_image_messages",
+    "wanted_types", "with_notes", "write_amended", "write_landmarks_csv", "write_log", "write_result", "write_tum",
 ]

@@ -64,28 +64,6 @@ def leave_out_dropped(recording: Recording) -> dict[str, str]:
     return {"log.live": "not given to the estimator live, so left out: " + "; ".join(texts)} if texts else {}
 
 
-def resumed_calibration(path: Path, given: PartialCalibration | None) -> PartialCalibration | None:
-    """Fields with which a live run goes on from a record: those that it had, and before them what the user gives now.
-
-    Sensors that it did not use are left out: their mountings may still come. None without either.
-
-    Raises
-    ------
-    CalibrationError
-        When the record has a calibration that is none.
-    """
-    recording = scan(path, lambda _: Keep.NONE)
-    recorded, config = read_calibration(recording), recorded_config(recording)
-    if recorded is None or config is None:
-        return given
-    values = {name: value for name, value in recorded.model_dump(mode="json").items() if value is not None}
-    for role, table in config.tables.items():
-        if table.get("use") is False:
-            values.pop(role, None)
-    recorded_fields = PartialCalibration(values, str(path))
-    return recorded_fields if given is None else given.over(recorded_fields)
-
-
 def recorded_config(recording: Recording) -> LogConfig | None:
     """Description of the topics in a log's own record, or None."""
     text = recording.metadata.get(METADATA, {}).get("log_config")
@@ -146,6 +124,28 @@ class LiveRecord:
         self._channels: dict[str, int] = {}
         self._newest_ns: dict[str, int] = {}
         self._of_dropped = parse_definition(DROPPED, definition(DROPPED))
+
+    @staticmethod
+    def resumed_calibration(path: Path, given: PartialCalibration | None) -> PartialCalibration | None:
+        """Fields with which a live run goes on from a record: those that it had, and before them what the user gives now.
+
+        Sensors that it did not use are left out: their mountings may still come. None without either.
+
+        Raises
+        ------
+        CalibrationError
+            When the record has a calibration that is none.
+        """
+        recording = scan(path, lambda _: Keep.NONE)
+        recorded, config = read_calibration(recording), recorded_config(recording)
+        if recorded is None or config is None:
+            return given
+        values = {name: value for name, value in recorded.model_dump(mode="json").items() if value is not None}
+        for role, table in config.tables.items():
+            if table.get("use") is False:
+                values.pop(role, None)
+        recorded_fields = PartialCalibration(values, str(path))
+        return recorded_fields if given is None else given.over(recorded_fields)
 
     def __enter__(self) -> Self:
         return self

@@ -130,7 +130,7 @@ def test_linear_samples_and_the_plane_of_the_image_give_nearly_the_same():
 
 def test_other_designs_and_blocks_of_more_frames_are_refused():
     model = RecogniserParams(confusion=confusion_for(DEFAULT_DESIGNS[:2]))
-    with pytest.raises(CalibrationError, match=r"\(1, 2\), the designs are \(1, 2, 3, 4\).*calibrate"):
+    with pytest.raises(CalibrationError, match=r" 1, 2, the designs are 1, 2, 3, 4; .*calibrate"):
         Recogniser(DECIBELS, params=model)
     assert Recogniser(DECIBELS, DEFAULT_DESIGNS[:2], model).ids.tolist() == [1, 2]
     recogniser, both = Recogniser(DECIBELS, params=EVERY), np.stack([picture(DISC, 1.7, 0.0, 0.0, k) for k in (1, 2)])
