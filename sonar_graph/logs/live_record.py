@@ -127,7 +127,7 @@ class LiveRecord:
 
     @staticmethod
     def resumed_calibration(path: Path, given: PartialCalibration | None) -> PartialCalibration | None:
-        """Fields with which a live run goes on from a record: those that it had, and before them what the user gives now.
+        """Fields with which a live run goes on: those of its record, and before them what the user gives now.
 
         Sensors that it did not use are left out: their mountings may still come. None without either.
 
