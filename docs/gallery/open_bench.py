@@ -17,7 +17,7 @@ TABLES = (
     ("Map, m", "landmarks.se2_m", 3),
     ("NEES of the causal position (1 fits)", "causal.nees_position", 3),
     ("99 % of the updates, ms", "update_p99_ms", 2),
-    ("Memory of a run, MB", "peak_memory_mb", 2),
+    ("Memory that the run adds, MB", "peak_memory_mb", 2),
 )
 
 

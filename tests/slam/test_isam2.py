@@ -273,13 +273,11 @@ def test_a_whole_history_takes_a_wrong_first_identity_back_and_a_bounded_one_kee
     assert sigma_m < 0.06
 
 
-def test_the_kernel_outvotes_a_first_range_that_is_wrong_by_a_metre_but_not_by_three():
-    """Although twenty-two right sightings follow: what they say has no pull so far away."""
+@pytest.mark.parametrize("by_m", [1.0, 3.0, 30.0])
+def test_twenty_two_right_sightings_outvote_a_first_range_however_wrong_it_is(by_m: float):
+    """From three metres on what they say has no pull, and the landmark begins anew (`misplaced`)."""
     assert len(sightings_of(LANDMARK)) == 23
-    assert error_and_sigma_m(ranged_wrongly(1.0))[0] < 0.05
-    error_m, sigma_m = error_and_sigma_m(ranged_wrongly(3.0))
-    assert error_m == pytest.approx(2.6, abs=0.2)
-    assert sigma_m < 0.25
+    assert error_and_sigma_m(ranged_wrongly(by_m))[0] < 0.05
 
 
 def test_answers_that_differ_in_one_bit_are_unlike() -> None:

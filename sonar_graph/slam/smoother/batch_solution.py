@@ -10,6 +10,7 @@ sightings say where to start it instead (docs/theory/isam2.md).
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -270,6 +271,12 @@ class Sightline:
         x, y, _ = self._world_T_sonar(values).transformTo(landmark)
         return bool(x * np.cos(self.z[1]) + y * np.sin(self.z[1]) <= 0)
 
+    def miss_m(self, values: gtsam.Values, landmark: Floats) -> float:
+        """Distance by which range and azimuth miss a point of the world."""
+        x, y, z = self._world_T_sonar(values).transformTo(landmark)
+        turn = (math.atan2(y, x) - self.z[1] + math.pi) % (2 * math.pi) - math.pi
+        return math.hypot(math.sqrt(x * x + y * y + z * z) - self.z[0], self.z[0] * turn)
+
     def _world_T_sonar(self, values: gtsam.Values) -> gtsam.Pose3:
         return values.atPose3(self.pose_key).compose(self.body_T_sonar)
 
@@ -278,13 +285,29 @@ Sightlines = Mapping[int, Sequence[Sightline]]
 """Sightings that have become factors, by landmark's key."""
 
 
-def turned_away(values: gtsam.Values, sightlines: Sightlines) -> list[int]:
-    """Landmarks that lie behind the sonar in at least half of their sightings."""
+OUTVOTED, LEAST_SCATTER_M = 5.0, 0.01
+"""A landmark lies where only a few sightings say if the median one misses it by so many times their scatter about the
+median of all, which is at least so much."""
+
+
+def misplaced(values: gtsam.Values, sightlines: Sightlines) -> list[int]:
+    """Landmarks behind the sonar in at least half of their sightings, or where only a few of them say (`OUTVOTED`).
+
+    A robust kernel leaves a landmark where its first sightings put it, however many contradict these: far from all of
+    them their loss hardly falls.
+    """
     found = []
     for key, lines in sightlines.items():
         landmark = values.atPoint3(key)
         if 2 * sum(line.is_behind(values, landmark) for line in lines) >= len(lines):
             found.append(key)
+        elif len(lines) > 2:
+            points = np.array([line.point(values)[:2] for line in lines])
+            scatter_m = np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1))
+            if np.median([line.miss_m(values, landmark) for line in lines]) > OUTVOTED * max(
+                scatter_m, LEAST_SCATTER_M
+            ):
+                found.append(key)
     return found
 
 
@@ -297,13 +320,13 @@ def placed_anew(values: gtsam.Values, sightlines: Sightlines, landmark_keys: lis
 
 
 def solve_in_sight(graph: gtsam.NonlinearFactorGraph, initial: gtsam.Values, sightlines: Sightlines) -> gtsam.Values:
-    """Solve a graph; again while a landmark is stuck behind the sonar and its new start lowers the error.
+    """Solve a graph; again while a landmark is misplaced and its new start lowers the error.
 
     All that begins anew may try `MAX_STEPS` together, so that a graph whose measurements contradict each other, where
-    landmarks stay behind, costs twice what one descent may.
+    landmarks stay misplaced, costs twice what one descent may.
     """
     (values, error, _), left = descended(graph, initial, MAX_STEPS), MAX_STEPS
-    while left and (stuck := turned_away(values, sightlines)):
+    while left and (stuck := misplaced(values, sightlines)):
         retried, lower, tried = descended(graph, placed_anew(values, sightlines, stuck), left)
         left -= tried
         if lower >= error:
