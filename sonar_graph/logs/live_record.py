@@ -134,7 +134,7 @@ class LiveRecord:
         Raises
         ------
         CalibrationError
-            When the record has a calibration that is none.
+            When the calibration in the record is invalid.
         """
         recording = scan(path, lambda _: Keep.NONE)
         recorded, config = read_calibration(recording), recorded_config(recording)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from sonar_graph import devices
 from sonar_graph.logs.mcap.writer import recording
 from sonar_graph.logs.reading import read_log
 from sonar_graph.logs.writing import sonar_image_messages, write_log
@@ -137,6 +138,14 @@ def test_a_model_that_calibrate_wrote_is_used(lane_log, run, tmp_path, monkeypat
     assert run("recognise", lane_log, "-o", tmp_path / "out.mcap", "--model", tmp_path / "model.json") == 0
     found = read_log(tmp_path / "out.mcap").detections
     assert np.median(found.range_azimuth_cov[:, 0, 0]) < 0.05**2
+
+
+def test_label_ends_with_a_command_that_has_the_options_that_it_was_given(lane_log, run, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("sonar_graph.cli.label.serve", lambda *_, **__: None)
+    designs, labels = Path(devices.__file__).with_name("default_landmarks.toml"), tmp_path / "labels.json"
+    assert run("label", lane_log, "-o", labels, "--designs", designs, "--no-browser") == 0
+    said = " ".join("".join(capsys.readouterr()).split())
+    assert f"Next: sonar-graph calibrate {lane_log} --labels {labels} --designs {designs} -o model.json" in said
 
 
 def test_labels_take_the_place_of_a_truth_and_mistakes_with_them_are_named(lane, lane_log, run, tmp_path, capsys):

@@ -304,9 +304,8 @@ def misplaced(values: gtsam.Values, sightlines: Sightlines) -> list[int]:
         elif len(lines) > 2:
             points = np.array([line.point(values)[:2] for line in lines])
             scatter_m = np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1))
-            if np.median([line.miss_m(values, landmark) for line in lines]) > OUTVOTED * max(
-                scatter_m, LEAST_SCATTER_M
-            ):
+            miss_m = np.median([line.miss_m(values, landmark) for line in lines])
+            if miss_m > OUTVOTED * max(scatter_m, LEAST_SCATTER_M):
                 found.append(key)
     return found
 
