@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize, minimize_scalar
@@ -59,6 +59,8 @@ class LabelledFits:
     """For each design, in the columns of `EVIDENCE`, shape (n, ids, 11)."""
     bound_m: Floats
     """`ObjectSighting.bound_m`, shape (n, 2)."""
+    moved_m: Floats
+    """`ObjectSighting.moved_m`, shape (n, 2)."""
     label: Ints
     """Index of the true class; the number of ids for "none of them", shape (n,)."""
     track: Ints
@@ -98,7 +100,7 @@ class LabelledSightings:
 
     def __init__(self, ids: tuple[int, ...]) -> None:
         self.ids = ids
-        self._rows: list[tuple[Floats, Floats, int, tuple[int, int], float, tuple[float, float], float, int]] = []
+        self._rows: list[tuple[Any, ...]] = []
 
     def add(
         self,
@@ -113,15 +115,14 @@ class LabelledSightings:
         """Add a sighting of a track (log, number), given the true range and azimuth of every landmark, shapes (m,)."""
         label, at = label_of(sighting, ids, range_m, azimuth_rad)
         known, fit = label != NONE, sighting.fit
-        if fit is None or sighting.bound_m is None or label == NO_LABEL or (known and label not in self.ids):
+        place = sighting.bound_m, sighting.moved_m
+        if fit is None or place[0] is None or label == NO_LABEL or (known and label not in self.ids):
             return
         error = np.nan, np.nan
         if known:
             error = sighting.range_m - range_m[at], range_m[at] * (sighting.azimuth_rad - azimuth_rad[at])
         row = self.ids.index(label) if known else len(self.ids)
-        self._rows.append(
-            (fit.evidence, sighting.bound_m, row, track, news, error, sighting.range_per_height, stamp_ns)
-        )
+        self._rows.append((fit.evidence, *place, row, track, news, error, sighting.range_per_height, stamp_ns))
 
     def add_frame(self, recogniser: Recogniser, run: Run, log: int) -> None:
         """Add what a recogniser saw in its last frame, of a log with truth; nothing at times that the truth lacks."""
@@ -142,11 +143,12 @@ class LabelledSightings:
 
     def fits(self) -> LabelledFits:
         """All of them as columns."""
-        columns = zip(*self._rows, strict=True) if self._rows else [()] * 8
-        evidence, bound, label, track, news, error, rise, stamp_ns = columns
+        columns = zip(*self._rows, strict=True) if self._rows else [()] * 9
+        evidence, bound, moved, label, track, news, error, rise, stamp_ns = columns
         return LabelledFits(
             np.array(evidence, float).reshape(-1, len(self.ids), len(EVIDENCE)),
             np.array(bound, float).reshape(-1, 2),
+            np.array(moved, float).reshape(-1, 2),
             np.array(label, np.int64),
             np.unique(np.reshape(track, (-1, 2)), axis=0, return_inverse=True)[1].ravel(),
             np.array(news, float),
@@ -263,6 +265,7 @@ def estimate_confusion(
         matrix = np.where(is_known[:, None], matrix, confusion_for(designs).array())
     height_bias_m, error = without_height(fits)
     found = accuracy(error, fits.bound_m, fits.track, Accuracy.of(shipped))
+    sigmas_m = np.hypot(found.sigmas_m(fits.bound_m), fits.moved_m)
     return Confusion(
         ids=ids,
         designs=tuple(map(mark_of, designs)),
@@ -277,9 +280,7 @@ def estimate_confusion(
         bound_power=found.power,
         height_bias_m=height_bias_m,
         roughness=roughness_of_tracks(fits, shipped.roughness),
-        report_interval_s=report_interval_s(
-            error / found.sigmas_m(fits.bound_m), fits.track, fits.stamp_ns, shipped.report_interval_s
-        ),
+        report_interval_s=report_interval_s(error / sigmas_m, fits.track, fits.stamp_ns, shipped.report_interval_s),
         provenance=provenance
         | ({"confusion matrix": f"too few frames, so as without calibration: {', '.join(poor)}"} if poor else {})
         | {f"frames of {n}": str(c) for n, c in zip(names, counts.tolist(), strict=True)}

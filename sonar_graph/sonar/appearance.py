@@ -71,6 +71,8 @@ class DesignFit:
     """(x, y) of each design's centre on the floor where it correlates best, shape (designs, 2)."""
     template: Ints
     """Row of each design's template in `Templates`, shape (designs,)."""
+    edge: Ints
+    """Edge beyond which each design is covered (`Figures.evidence`), -1: none, shape (designs,)."""
 
 
 class Search(NamedTuple):
@@ -123,16 +125,18 @@ class Appearance:
             search.cells, search.pictures, search.squares, search.sums, search.first, search.row,
             params.least_searched, template, cell, top,
         )  # fmt: skip
-        if visible < params.least_visible or (evidence := self.figures.evidence(patch, template, cell)) is None:
+        if visible < params.least_visible or (found := self.figures.evidence(patch, template, cell)) is None:
             return None
+        evidence, edge = found
         centre_m = patch.centre_m + params.cell_m * (top - self._steps)
-        return DesignFit(evidence, visible, self.templates.heading_rad[template], centre_m, template)
+        return DesignFit(evidence, visible, self.templates.heading_rad[template], centre_m, template, edge)
 
-    def place(self, patch: Patch, fit: DesignFit, design: int, grazing_slope: float) -> tuple[Floats, Floats]:
-        """Place of a design in a patch that it fits, and the bound of its standard deviations (x, y on the floor, m).
+    def place(self, patch: Patch, fit: DesignFit, design: int, grazing_slope: float) -> tuple[Floats, Floats, Floats]:
+        """Place of a design that fits a patch, the bound of its standard deviations, and how far a cover moves it.
 
-        ``grazing_slope`` is the height of the sonar over the distance along the floor. Only so many cells count for the
-        bound as are independent.
+        All are x and y on the floor, m. ``grazing_slope`` is the height of the sonar over the distance along the floor.
+        Only so many cells count for the bound as are independent. The last one leads from the place to that of the
+        uncovered part alone; 0 where nothing seems covered.
         """
         cell_m, relief_m, origin = self.params.cell_m, self._designs[design].standing_m, self._rim + self._steps
         shadow_m = relief_m * (grazing_slope + 1 / grazing_slope)
@@ -141,11 +145,18 @@ class Appearance:
         if drawn not in self._reliefs:
             heading_rad, side = float(self.templates.heading_rad[row]), self.templates.side
             self._reliefs[drawn] = Relief.of(self._designs[design], heading_rad, side, cell_m, self._blur_m, steps)
-        start = (fit.centre_m[design] - patch.centre_m) / cell_m + origin
-        place, bound = self._reliefs[drawn].place(
-            patch.level_db, patch.seen, self._compared, start, relief_m * grazing_slope, shade - steps
-        )
-        return patch.centre_m + cell_m * (place - origin), cell_m / math.sqrt(self.figures.independent) * bound
+        start, side_m = (fit.centre_m[design] - patch.centre_m) / cell_m + origin, relief_m * grazing_slope
+        cells, relief, moved = self._compared, self._reliefs[drawn], np.zeros(2)
+        place, bound = relief.place(patch.level_db, patch.seen, cells, start, side_m, shade - steps)
+        if (edge := int(fit.edge[design])) >= 0:
+            x_m, y_m = (cell_m * (one - self.templates.side // 2) for one in cells)
+            is_kept = self.figures.is_kept(row, edge, x_m, y_m)
+            kept = cells[0][is_kept], cells[1][is_kept]
+            of_kept, bound_of_kept = relief.place(patch.level_db, patch.seen, kept, place, side_m, shade - steps)
+            if np.isfinite(bound_of_kept).all():
+                moved = of_kept - place
+        bound_m = cell_m / math.sqrt(self.figures.independent) * bound
+        return patch.centre_m + cell_m * (place - origin), bound_m, cell_m * moved
 
 
 def numbered_places(side: int) -> Ints:
@@ -288,6 +299,9 @@ class ObjectSighting:
     bound_m: Floats | None = None
     """Cramer-Rao bound of the standard deviations of the best design along the ray and across it, range times azimuth,
     shape (2,); None without a fit."""
+    moved_m: Floats | None = None
+    """How far what seems to cover a part moves the place, along the ray and across it, shape (2,): 0 where nothing
+    does, None without a fit."""
 
 
 class Fitted(NamedTuple):
@@ -298,6 +312,8 @@ class Fitted(NamedTuple):
     """(x, y), x away from the sonar through the middle of the patch, shape (2,)."""
     bound_m: Floats
     """Cramer-Rao bound of its standard deviations, shape (2,)."""
+    moved_m: Floats
+    """How far what seems to cover a part moves it, shape (2,)."""
 
 
 @lru_cache(maxsize=64)
@@ -375,6 +391,7 @@ class CandidateFit:
         covariance, rise = np.zeros((len(fits), 2, 2)), np.zeros(len(fits))
         covariance[:, 0, 0], covariance[:, 1, 1] = CENTROID_SIGMA_M**2, (CENTROID_SIGMA_M / range_m) ** 2
         bounds: list[Floats | None] = [None] * len(fits)
+        moves: list[Floats | None] = [None] * len(fits)
         if fitted:
             rows = np.flatnonzero([fit is not None for fit in fits])
             x, y = np.array([fit.centre_m for fit in fitted]).T
@@ -384,12 +401,15 @@ class CandidateFit:
             rise[rows] = 0.0 if view is None else view.height_m / r
             range_m[rows] = r + model.height_bias_m * rise[rows]
             away_m = np.hypot(x, y)
-            bound = np.array([fit.bound_m for fit in fitted]) * np.array([away_m / r, r / away_m]).T
-            covariance[rows] = np.minimum(model.range_azimuth_cov(bound, r), covariance[rows])
-            for row, one in zip(rows.tolist(), bound, strict=True):
-                bounds[row] = one
+            to_ray = np.array([away_m / r, r / away_m]).T
+            bound, moved = (to_ray * [getattr(fit, name) for fit in fitted] for name in ("bound_m", "moved_m"))
+            of_place = model.range_azimuth_cov(bound, r)
+            of_place[:, [0, 1], [0, 1]] += (moved / np.column_stack([np.ones_like(r), r])) ** 2
+            covariance[rows] = np.minimum(of_place, covariance[rows])
+            for row, *one in zip(rows.tolist(), bound, moved, strict=True):
+                bounds[row], moves[row] = one
         of = [None if fit is None else fit.of_designs for fit in fits]
-        columns = of, range_m.tolist(), azimuth_rad.tolist(), covariance, rise.tolist(), bounds
+        columns = of, range_m.tolist(), azimuth_rad.tolist(), covariance, rise.tolist(), bounds, moves
         return [ObjectSighting(*row) for row in zip(*columns, strict=True)]
 
     def log_odds(self, sightings: Sequence[ObjectSighting | None]) -> Floats:

@@ -43,6 +43,7 @@ level leaves; covered: ln R(design without S) / R(covered)."""
 POWER_OF_CELLS = np.array([1.0 if name in ("outline", "figure", "rival", "covered") else 0.0 for name in EVIDENCE])
 POWER_OF_CELLS[EVIDENCE.index("plate")] = 0.5
 """Power of the share of independent cells by which columns count: logarithms of ratios of two R, and a root of one."""
+COVERED = EVIDENCE.index("covered")
 HALF_POWER = 2 * math.sqrt(2 * math.log(2))
 """Width at half of the power over the standard deviation."""
 STRETCHES = (
@@ -98,6 +99,8 @@ class Figures(NamedTuple):
     """Number of edges of each direction that a cell lies beyond, shape (n, EDGES)."""
     kept: Floats
     """`kept_sums` of each template, shape (templates, EDGES, offsets, 3)."""
+    radius_m: Floats
+    """Of the disc that has the figure's second moment, shape (templates,)."""
     independent: float
     """Share of the cells that are independent: cells are not where the sonar resolves less."""
     counts: Floats
@@ -113,8 +116,7 @@ class Figures(NamedTuple):
         away_m = np.hypot(x_m, y_m)
         area = (away_m <= material_m + REACH_M) | ((away_m <= material_m + SHADOW_M) & (x_m > 0.5 * away_m))
         kernel = np.ones((2 * NEAR_CELLS + 1, 2 * NEAR_CELLS + 1), np.uint8)
-        towards = 2 * math.pi * np.arange(EDGES) / EDGES
-        beyond_m = x_m[:, :, None] * np.cos(towards) + y_m[:, :, None] * np.sin(towards)
+        beyond_m = np.stack([along_edge(x_m, y_m, edge) for edge in range(EDGES)], axis=-1)
         columns = []
         for index, heading in zip(templates.design.tolist(), templates.heading_rad.tolist(), strict=True):
             design = designs[index]
@@ -135,31 +137,39 @@ class Figures(NamedTuple):
             kept, in_steps = np.empty((EDGES, len(OFFSETS), 3)), values.astype(float)
             gram = float(STEP) ** 2 * (in_steps.T @ in_steps)
             x, y = np.nonzero(compared)
-            strips = (beyond_m[compared] > radius_m(figure, away_m) * np.array(OFFSETS)[:, None, None]).sum(axis=0)
+            radius_m = math.sqrt(2 * float(np.average(away_m**2, weights=np.maximum(figure, 0.0))))
+            strips = (beyond_m[compared] > radius_m * np.array(OFFSETS)[:, None, None]).sum(axis=0)
             at = (x * (side + last) + y).astype(np.int32)
             own = at, values, smooth, zones[compared].astype(np.uint8), strips.astype(np.uint8)
             kept_sums(values, np.ones(len(values), np.float32), own[-1], kept)
-            columns.append((*own, gram, has_dark, kept))
-        *rows, grams, darks, sums = zip(*columns, strict=True)
+            columns.append((*own, gram, has_dark, kept, radius_m))
+        *rows, grams, darks, sums, radii_m = zip(*columns, strict=True)
         first = np.cumsum([0, *map(len, rows[0])])
         cells, values, smooth, zones, strips = (np.ascontiguousarray(np.concatenate(of)) for of in rows)
         independent = math.prod(min(cell_m / (HALF_POWER * blur), 1.0) for blur in blur_m)
-        of_templates = np.array(grams), np.array(darks), strips, np.array(sums)
+        of_templates = np.array(grams), np.array(darks), strips, np.array(sums), np.array(radii_m)
         counts = independent**POWER_OF_CELLS
         return cls(side + last, first, cells, values, smooth, zones, *of_templates, independent, counts)
 
-    def evidence(self, patch: Patch, template: Ints, cell: Ints) -> Floats | None:
-        """`EVIDENCE` of templates on the parts of a patch that begin at some cells, shapes (n,), (n, 2), (n, 11).
+    def evidence(self, patch: Patch, template: Ints, cell: Ints) -> tuple[Floats, Ints] | None:
+        """`EVIDENCE` of templates on the parts of a patch that begin at some cells, and the edges that cover them.
 
-        None where too little of one is in view, or where it has one level.
+        Shapes (n,), (n, 2), (n, 11) and (n,). None where too little of one is in view, or where it has one level. An
+        edge is numbered by direction and offset; -1: the whole figure is at least as probable as a covered one, all
+        edges being as probable together as none.
         """
-        found = np.empty((len(template), len(EVIDENCE)))
+        found, edge = np.empty((len(template), len(EVIDENCE))), np.full(len(template), -1)
         is_measured = fill_evidence(
             patch.level_db.ravel(), patch.seen.ravel(), patch.smooth_db.ravel(), patch.held.ravel(), self.patch_side,
             self.first, self.cells, self.values, self.smooth, self.zones, self.gram, self.has_dark, self.strips,
-            self.kept, self.counts, template, cell, found,
+            self.kept, self.counts, template, cell, found, edge,
         )  # fmt: skip
-        return found if is_measured else None
+        return (found, edge) if is_measured else None
+
+    def is_kept(self, template: int, edge: int, x_m: Floats, y_m: Floats) -> Bools:
+        """Whether places about the middle of a template lie on the uncovered side of an edge."""
+        direction, offset = divmod(edge, len(OFFSETS))
+        return np.asarray(along_edge(x_m, y_m, direction) <= OFFSETS[offset] * self.radius_m[template])
 
 
 @compiled
@@ -167,9 +177,9 @@ def fill_evidence(
     level_db: Floats32, seen: Floats32, smooth_db: Floats32, held: Floats32, side: int,
     first_of: Ints, all_cells: NDArray[np.int32], all_values: Bytes, all_smooth: Floats32, all_zones: Bytes,
     grams: Floats, has_dark: Bools, all_strips: Bytes, all_kept: Floats, counts: Floats, template: Ints, cell: Ints,
-    found: Floats,
+    found: Floats, edge: Ints,
 ) -> bool:  # fmt: skip
-    """Fill in `EVIDENCE` of templates on the parts of a patch that begin at some cells, shape (n, 11).
+    """Fill in `EVIDENCE` of templates on the parts of a patch that begin at some cells, shape (n, 11), and edges.
 
     A patch comes row by row, each ``side`` cells; what is known of templates as in `Figures`. False where too little is
     in view, or where it has one level.
@@ -248,8 +258,11 @@ def fill_evidence(
         if count < rows:
             kept = np.empty(kept.shape)
             kept_sums(values, is_seen, strips, kept)
-        covered = least_covered(level, values, strips, kept, count, gram, only_dark, dz, delta < 0)
-        covered = min(covered, design if beta > 0 else only_dark)
+        whole = design if beta > 0 else only_dark
+        covered, best = least_covered(level, values, strips, kept, count, gram, only_dark, dz, delta < 0)
+        if 0.5 * count * counts[COVERED] * math.log(max(whole / covered, 1.0)) > math.log(EDGES * len(OFFSETS)):
+            edge[k] = best
+        covered = min(covered, whole)
         found[k, 9], found[k, 10] = math.log(covered / total), math.log(max(design / covered, 1.0))
         least = min(least, found[k, 9])
     for k in range(len(template)):
@@ -291,11 +304,12 @@ def kept_sums(values: Bytes, seen: Floats32, strips: Bytes, kept: Floats) -> Non
 def least_covered(
     level: Floats32, values: Bytes, strips: Bytes, kept: Floats, count: float, gram: Floats,
     only_dark: float, dz: float, has_dark: bool,
-) -> float:  # fmt: skip
-    """Least sum of squares that a figure leaves of which all beyond a straight edge is covered, with D or without.
+) -> tuple[float, int]:  # fmt: skip
+    """Least sum of squares that a figure leaves of which all beyond a straight edge is covered, and that edge.
 
-    The floor and D are taken out of the figure first: ``R = R(floor, D) - (b^T z)^2 / b^T b``. ``only_dark`` is
-    R(floor, D), ``dz`` the product of D, without its mean, and z.
+    With D or without; edge -1: nothing of the figure is seen. The floor and D are taken out of the figure first:
+    ``R = R(floor, D) - (b^T z)^2 / b^T b``. ``only_dark`` is R(floor, D), ``dz`` the product of D, without its mean,
+    and z.
     """
     edges, offsets, _ = kept.shape
     products = np.zeros((offsets + 1, edges), np.float32)
@@ -305,7 +319,7 @@ def least_covered(
             bz = b_n * level[n]
             for e in range(edges):
                 products[strips[n, e], e] += bz
-    dark_mean, dd, least = gram[0, 1] / count, gram[1, 1] - gram[0, 1] ** 2 / count, only_dark
+    dark_mean, dd, least, best = gram[0, 1] / count, gram[1, 1] - gram[0, 1] ** 2 / count, only_dark, -1
     for e in range(edges):
         bz = 0.0
         for strip in range(offsets):
@@ -314,14 +328,15 @@ def least_covered(
             if has_dark:
                 bd = kept[e, strip, 2] - b * dark_mean
                 bb, with_z = bb - bd**2 / dd, bz - bd * dz / dd
-            if bb > 0 and with_z > 0:
-                least = min(least, only_dark - with_z**2 / bb)
-    return max(least, 1e-3)
+            if bb > 0 and with_z > 0 and only_dark - with_z**2 / bb < least:
+                least, best = only_dark - with_z**2 / bb, e * offsets + strip
+    return max(least, 1e-3), best
 
 
-def radius_m(figure: Floats32, away_m: Floats) -> float:
-    """Radius of the disc that has the second moment of a figure about its middle."""
-    return math.sqrt(2 * float(np.average(away_m**2, weights=np.maximum(figure, 0.0))))
+def along_edge(x_m: Floats, y_m: Floats, direction: int) -> Floats:
+    """How far places lie in one of `EDGES` directions."""
+    towards_rad = 2 * math.pi * direction / EDGES
+    return np.asarray(x_m * math.cos(towards_rad) + y_m * math.sin(towards_rad))
 
 
 @compiled

@@ -18,14 +18,16 @@ from sonar_graph.sonar.confusion import Confusion, confusion_for, soft_scores
 from sonar_graph.sonar.evidence import EVIDENCE
 from sonar_graph.sonar.recogniser import Recogniser, RecogniserParams
 
-BOUND = np.array([0.003, 0.0008])
+BOUND, MOVED = np.array([0.003, 0.0008]), np.array([0.0, 0.004])
 IDS, RANGE_M, AZIMUTH_RAD = np.array([5, 3]), np.array([2.0, 1.5]), np.array([0.1, -0.2])
 
 
 def sighting(range_m: float, azimuth_rad: float, *, is_compared: bool = True) -> ObjectSighting:
     evidence = np.outer([0.9, 0.3], np.ones(len(EVIDENCE)))
-    fit = DesignFit(evidence, 0.95, np.zeros(2), np.zeros((2, 2)), np.zeros(2, int)) if is_compared else None
-    return ObjectSighting(fit, range_m, azimuth_rad, np.eye(2), 0.5, BOUND if is_compared else None)
+    if not is_compared:
+        return ObjectSighting(None, range_m, azimuth_rad, np.eye(2), 0.5)
+    fit = DesignFit(evidence, 0.95, np.zeros(2), np.zeros((2, 2)), np.zeros(2, int), np.full(2, -1))
+    return ObjectSighting(fit, range_m, azimuth_rad, np.eye(2), 0.5, BOUND, MOVED)
 
 
 def test_a_sighting_is_of_what_truly_lies_there():
@@ -56,6 +58,7 @@ def test_sightings_become_columns_with_their_errors():
     assert fits.label.tolist() == [1, 0, 2]  # in the order of the designs; what is unclear or not compared is left out
     np.testing.assert_allclose(fits.evidence, np.tile(fitted.fit.evidence, (3, 1, 1)))
     np.testing.assert_allclose(fits.bound_m, [BOUND] * 3)
+    np.testing.assert_allclose(fits.moved_m, [MOVED] * 3)
     np.testing.assert_allclose(fits.news, [0, 0.25, 0.5])
     np.testing.assert_allclose(fits.range_per_height, 0.5)
     assert fits.stamp_ns.tolist() == [1000, 1001, 1002]
@@ -165,6 +168,7 @@ def _fits(per_class: int, noise: float, seed: int = 0, scale: float = 1.0) -> co
     return confusion_fit.LabelledFits(
         odds[..., None] * direction,
         np.tile(BOUND, (n, 1)),
+        np.zeros((n, 2)),
         label,
         np.arange(n),
         np.ones(n),

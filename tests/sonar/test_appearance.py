@@ -1,6 +1,7 @@
 """Laws of templates, of patches of the floor, of the fit of designs to them, and of the sightings that follow."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -239,8 +240,8 @@ def odds(fit: DesignFit, model: Confusion = MODEL) -> np.ndarray:
     return model.log_odds(fit.evidence)
 
 
-def plain_evidence(figures: Figures, template: int, x: int, y: int, patch: Patch) -> list[float]:
-    """The equations of the module in NumPy: least squares on the cells in view, over and over."""
+def plain_evidence(figures: Figures, template: int, x: int, y: int, patch: Patch) -> tuple[list[float], int]:
+    """The equations of the module in NumPy: least squares on the cells in view, over and over; and the edge."""
     rows, side = slice(*figures.first[template : template + 2]), len(patch.seen)
     i, j = np.divmod(figures.cells[rows], side) + np.array([[x], [y]])
     seen, held = patch.seen[i, j] > 0, patch.held[i, j] > 0.5
@@ -272,19 +273,21 @@ def plain_evidence(figures: Figures, template: int, x: int, y: int, patch: Patch
     kept = np.where(B > 0.12, B, 0.0)
     radius = np.sqrt(2 * (away**2).sum(axis=0) @ np.maximum(B, 0) / np.maximum(B, 0).sum())
     without_figure = fitted(one, dark)[0] if delta < 0 else fitted(one)[0]
-    covered = without_figure
-    for towards in 2 * np.pi * np.arange(12) / 12:
-        for offset in (0.15, 0.4, 0.65):
-            part = kept * (away[0] * np.cos(towards) + away[1] * np.sin(towards) <= offset * radius)
-            A = np.stack([np.ones_like(part), *([values[:, dark]] if delta < 0 else []), part])[:, seen].T
-            c = np.linalg.lstsq(A, level[seen].astype(float), rcond=None)[0]
-            covered = min(covered, float(((level[seen] - A @ c) ** 2).sum())) if c[-1] > 0 else covered
-    covered = min(covered, best) if beta > 0 else covered
+    covered, edge, edges = without_figure, -1, product(2 * np.pi * np.arange(12) / 12, (0.15, 0.4, 0.65))
+    for number, (towards, offset) in enumerate(edges):
+        part = kept * (away[0] * np.cos(towards) + away[1] * np.sin(towards) <= offset * radius)
+        A = np.stack([np.ones_like(part), *([values[:, dark]] if delta < 0 else []), part])[:, seen].T
+        c = np.linalg.lstsq(A, level[seen].astype(float), rcond=None)[0]
+        if c[-1] > 0 and (left := float(((level[seen] - A @ c) ** 2).sum())) < covered:
+            covered, edge = left, number
+    whole = best if beta > 0 else without_figure
+    edge = edge if figures.independent * seen.sum() / 2 * np.log(whole / covered) > np.log(36) else -1
+    covered = min(covered, whole)
     off = smooth - floor - beta * design[:, 1] - delta * design[:, 0]
     near, far, back = ((zones & zone > 0) & held for zone in (NEAR, FAR, BEHIND))
     back &= seen
     mean_square = best / seen.sum()
-    return [
+    columns = [
         1.0,
         np.log(min(others) / both),
         np.log(min(fitted(one, figure + q)[0] for q in range(shades - figure)) / plain),
@@ -297,6 +300,7 @@ def plain_evidence(figures: Figures, template: int, x: int, y: int, patch: Patch
         np.log(covered / (level[seen] @ level[seen])),
         max(np.log(best / covered), 0.0),
     ]
+    return columns, edge
 
 
 @pytest.mark.parametrize(("rim", "blur_m"), [(99, BLUR_M), (30, BLUR_M), (26, BLUR_M), (99, (0.008, 0.02))])
@@ -308,7 +312,7 @@ def test_evidence_is_that_of_least_squares_over_the_cells_in_view(rim: int, blur
     appearance = Appearance(DEFAULT_DESIGNS, blur_m)
     share = np.prod([min(0.015 / (2.3548 * one), 1.0) for one in blur_m])
     templates, figures, rng = appearance.templates, appearance.figures, np.random.default_rng(rim)
-    side, has = appearance.patch_side, set()
+    side, has, is_edge = appearance.patch_side, set(), set()
     i, j = np.divmod(templates.cells, templates.side) + np.array([[3 + appearance._rim], [2 + appearance._rim]])
     seen = (np.arange(side) < rim) & (rng.random((side, side)) > (0.0 if rim > side else 0.05))
     seen = seen.astype(np.float32)
@@ -318,9 +322,13 @@ def test_evidence_is_that_of_least_squares_over_the_cells_in_view(rim: int, blur
         level[side // 2 + (5, 12)[template % 2] :] -= (0, 8)[template // 2 % 2]
         patch = Patch.of(level * seen, seen, np.zeros(2))
         another, at = (template + 1) % len(templates.design), np.array([[3, 2], [3, 3]])
-        found, rival = figures.evidence(patch, np.array([template, another]), at)
-        expected = np.array(plain_evidence(figures, template, 3, 2, patch))
-        shares = expected[9], plain_evidence(figures, another, 3, 3, patch)[9]
+        (found, rival), edges = figures.evidence(patch, np.array([template, another]), at)
+        (own, edge), (of_another, edge_of_another) = (
+            plain_evidence(figures, one, *place, patch) for one, place in zip((template, another), at, strict=True)
+        )
+        assert edges.tolist() == [edge, edge_of_another]
+        is_edge |= {*(edges >= 0)}
+        expected, shares = np.array(own), (own[9], of_another[9])
         expected[9] = min(shares) - expected[9]
         expected[[1, 2, 9, 10]] *= share
         expected[7] *= np.sqrt(share)
@@ -328,6 +336,7 @@ def test_evidence_is_that_of_least_squares_over_the_cells_in_view(rim: int, blur
         assert rival[9] == pytest.approx(share * (min(shares) - shares[1]), abs=5e-5)
         has |= {name for name, *values in zip(EVIDENCE, found, rival, strict=True) if any(values)}
     assert has == {*EVIDENCE} - ({"bare"} if figures.has_dark.all() else set())
+    assert is_edge == {True, False}
 
 
 @pytest.mark.parametrize("design", DEFAULT_DESIGNS, ids=lambda design: design.name)
@@ -348,8 +357,8 @@ def test_zones_of_which_only_a_few_cells_are_in_view_say_nothing(appearance, wid
     seen = (inside[:, None] & inside).astype(np.float32)
     for template in range(len(templates.design)):
         patch = Patch.of(rng.normal(40, 4, (side, side)).astype(np.float32) * seen, seen, np.zeros(2))
-        (found,) = figures.evidence(patch, np.array([template]), np.array([[3, 2]]))
-        np.testing.assert_allclose(found[4:7], plain_evidence(figures, template, 3, 2, patch)[4:7], atol=2e-3)
+        ((found,), _) = figures.evidence(patch, np.array([template]), np.array([[3, 2]]))
+        np.testing.assert_allclose(found[4:7], plain_evidence(figures, template, 3, 2, patch)[0][4:7], atol=2e-3)
 
 
 def test_gain_and_floor_level_change_nothing(appearance):

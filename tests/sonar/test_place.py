@@ -128,10 +128,36 @@ def test_noise_that_the_sonar_does_not_resolve_moves_a_place_by_its_bound(blur_m
         patch = Patch.of(level.astype(np.float32), np.ones((side, side), np.float32), np.zeros(2))
         fit = replace(looks.fit(patch), template=np.full(4, row), centre_m=np.zeros((4, 2)))
         found.append(looks.place(patch, fit, 1, 0.577))
-    places, bounds = map(np.array, zip(*found, strict=True))
+    places, bounds, _ = map(np.array, zip(*found, strict=True))
     share = np.std(places, axis=0) / np.sqrt(np.mean(bounds**2, axis=0))
     assert (share > 0.75).all()
     assert (share < 1.45).all()
+
+
+@pytest.mark.parametrize("is_covered", [True, False])
+def test_a_place_is_as_uncertain_as_what_covers_a_part_moves_it(is_covered: bool):
+    """Any design, cut off 4 to 8 cm from its middle in any direction, or whole; error over what is said, squared."""
+    looks, rng = Appearance(DEFAULT_DESIGNS, BLUR_M), np.random.default_rng(3)
+    templates, side = looks.templates, looks.patch_side
+    x_m, y_m = CELL_M * (np.mgrid[: templates.side, : templates.side] - templates.side // 2)
+    inside, found = slice((side - templates.side) // 2, (side + templates.side) // 2), []
+    for row in rng.integers(len(templates.design), size=80).tolist():
+        picture, towards_rad = np.zeros((templates.side, templates.side)), rng.uniform(0, 2 * np.pi)
+        picture.ravel()[templates.cells] = templates.pictures[row]
+        beyond_m = x_m * np.cos(towards_rad) + y_m * np.sin(towards_rad)
+        picture[beyond_m > rng.uniform(0.04, 0.08)] *= not is_covered
+        level = rng.normal(40, 4, (side, side))
+        level[inside, inside] += picture
+        patch = Patch.of(level.astype(np.float32), np.ones((side, side), np.float32), np.zeros(2))
+        found.append(looks.place(patch, looks.fit(patch), int(templates.design[row]), 0.577))
+    error, bound, moved = map(np.array, zip(*found, strict=True))
+    of_bound, of_both = (np.mean(error**2 / variance, axis=0) for variance in (bound**2, bound**2 + moved**2))
+    assert moved.any(axis=1).mean() == is_covered
+    if is_covered:
+        assert (of_bound > 9).all()
+        assert (of_both < 0.4 * of_bound).all()
+    else:
+        assert (of_both < 1.3).all()
 
 
 @pytest.mark.parametrize("floor_db", [-60.0, 0.0, 90.0])
@@ -208,7 +234,8 @@ def test_side_and_shadow_of_a_place_are_those_of_the_slope_at_which_the_sonar_lo
         centre_m = np.array([2.0, 0.1])
         patch = Patch(level.astype(np.float32), seen, level.astype(np.float32), seen, centre_m)
         at = centre_m + cell_m * np.array([1, -2])
-        fit = DesignFit(np.zeros((1, 11)), 1.0, np.array([heading_rad]), at[None] + 0.004, np.array([row]))
-        place_m, bound_m = appearance.place(patch, fit, 0, other)
+        whole = np.array([-1])
+        fit = DesignFit(np.zeros((1, 11)), 1.0, np.array([heading_rad]), at[None] + 0.004, np.array([row]), whole)
+        place_m, bound_m, _ = appearance.place(patch, fit, 0, other)
         np.testing.assert_allclose(place_m, at, atol=2e-5)
         assert (bound_m < 2e-5).all()

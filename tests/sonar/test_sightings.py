@@ -61,8 +61,8 @@ def test_range_and_azimuth_are_those_of_the_centre_and_as_certain_as_the_fit(tri
     r, a = polar((1.7, 0.05))
     assert odds(found.fit).argmax() == TRIANGLE
     assert (found.range_m, found.azimuth_rad) == (pytest.approx(r, abs=0.006), pytest.approx(a, abs=0.004))
-    sigmas = np.array([0.01, 0.008 / found.range_m]) * (found.bound_m / [1e-3, 1.2e-3]) ** 1.5
-    np.testing.assert_allclose(found.covariance, np.diag(sigmas**2))
+    sigmas_m = np.hypot(np.array([0.01, 0.008]) * (found.bound_m / [1e-3, 1.2e-3]) ** 1.5, found.moved_m)
+    np.testing.assert_allclose(found.covariance, np.diag((sigmas_m / [1, found.range_m]) ** 2))
 
 
 def test_a_fit_tells_no_less_than_the_centroid_of_its_candidate(triangle):
