@@ -183,15 +183,13 @@ def find_places(
     for at in range(len(seen)):
         levels[at] = (level_db[at] - mean) * seen[at]
     # what lies under the templates, at the places where they are laid
-    level, held = (
-        np.empty((places * places, len(cells)), np.float32),
-        np.empty((places * places, len(cells)), np.float32),
-    )
+    level = np.empty((places * places, len(cells)), np.float32)
+    held = np.ones((places * places if is_cut else 1, len(cells)), np.float32)
     of_level = np.zeros((places * places, 3), np.float32)
     for x in range(0, places, COARSE):
         for y in range(0, places, COARSE):
             row = row_of[x, y]
-            lay(levels, seen, cells, x * side + y, is_cut, level[row], held[row], of_level[row])
+            lay(levels, seen, cells, x * side + y, is_cut, level[row], held[row if is_cut else 0], of_level[row])
     rows, step = ((places + COARSE - 1) // COARSE) ** 2, max(1, MOST_MULTIPLICATIONS // pictures.size)
     found = np.empty((rows, len(pictures)), np.float32)
     for begin in range(0, rows, step):
@@ -232,7 +230,9 @@ def find_places(
                     continue
                 row = row_of[i, j]
                 if of_level[row, 0] == 0:
-                    lay(levels, seen, cells, i * side + j, is_cut, level[row], held[row], of_level[row])
+                    lay(
+                        levels, seen, cells, i * side + j, is_cut, level[row], held[row if is_cut else 0], of_level[row]
+                    )
                 if is_cut:
                     b_k, bb_k = np.dot(held[row], picture), np.dot(held[row], square)
                 known[i, j] = correlation(of_level[row], b_k, bb_k, np.dot(level[row], picture))
@@ -256,7 +256,7 @@ def lay(
 ) -> None:  # fmt: skip
     """Fill in levels, and whether they are seen, in cells so far on; their number, sum and sum of squares."""
     for c in range(len(cells)):
-        level[c], held[c] = levels[np.uint32(cells[c] + shift)], 1.0
+        level[c] = levels[np.uint32(cells[c] + shift)]
     if is_cut:
         for c in range(len(cells)):
             held[c] = seen[np.uint32(cells[c] + shift)]

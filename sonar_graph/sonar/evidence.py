@@ -95,10 +95,10 @@ class Figures(NamedTuple):
     """``values^T values`` of each template, shape (templates, 2 + 2 figures, 2 + 2 figures)."""
     has_dark: Bools
     """Whether it has dark parts, shape (templates,)."""
-    strips: Bytes
-    """Number of edges of each direction that a cell lies beyond, shape (n, EDGES)."""
+    uncovered: Bytes
+    """1 in cells on the uncovered side of each edge, shape (n, edges)."""
     kept: Floats
-    """`kept_sums` of each template, shape (templates, EDGES, offsets, 3)."""
+    """`kept_sums` of each template, shape (templates, edges, 3)."""
     radius_m: Floats
     """Of the disc that has the figure's second moment, shape (templates,)."""
     independent: float
@@ -134,20 +134,20 @@ class Figures(NamedTuple):
             exact = np.stack([np.ones_like(figure), dark, *figures, *shades])[:, compared].T
             values = np.clip(np.rint(exact / STEP), 0, 255).astype(np.uint8)
             smooth = np.stack([cv2.blur(dark, (3, 3)), cv2.blur(figure, (3, 3))])[:, compared].T.astype(np.float32)
-            kept, in_steps = np.empty((EDGES, len(OFFSETS), 3)), values.astype(float)
+            kept, in_steps = np.empty((EDGES * len(OFFSETS), 3)), values.astype(float)
             gram = float(STEP) ** 2 * (in_steps.T @ in_steps)
             x, y = np.nonzero(compared)
             radius_m = math.sqrt(2 * float(np.average(away_m**2, weights=np.maximum(figure, 0.0))))
-            strips = (beyond_m[compared] > radius_m * np.array(OFFSETS)[:, None, None]).sum(axis=0)
+            uncovered = beyond_m[compared][:, :, None] <= radius_m * np.array(OFFSETS)
             at = (x * (side + last) + y).astype(np.int32)
-            own = at, values, smooth, zones[compared].astype(np.uint8), strips.astype(np.uint8)
+            own = at, values, smooth, zones[compared].astype(np.uint8), uncovered.reshape(len(at), -1).astype(np.uint8)
             kept_sums(values, np.ones(len(values), np.float32), own[-1], kept)
             columns.append((*own, gram, has_dark, kept, radius_m))
         *rows, grams, darks, sums, radii_m = zip(*columns, strict=True)
         first = np.cumsum([0, *map(len, rows[0])])
-        cells, values, smooth, zones, strips = (np.ascontiguousarray(np.concatenate(of)) for of in rows)
+        cells, values, smooth, zones, uncovered = (np.ascontiguousarray(np.concatenate(of)) for of in rows)
         independent = math.prod(min(cell_m / (HALF_POWER * blur), 1.0) for blur in blur_m)
-        of_templates = np.array(grams), np.array(darks), strips, np.array(sums), np.array(radii_m)
+        of_templates = np.array(grams), np.array(darks), uncovered, np.array(sums), np.array(radii_m)
         counts = independent**POWER_OF_CELLS
         return cls(side + last, first, cells, values, smooth, zones, *of_templates, independent, counts)
 
@@ -161,7 +161,7 @@ class Figures(NamedTuple):
         found, edge = np.empty((len(template), len(EVIDENCE))), np.full(len(template), -1)
         is_measured = fill_evidence(
             patch.level_db.ravel(), patch.seen.ravel(), patch.smooth_db.ravel(), patch.held.ravel(), self.patch_side,
-            self.first, self.cells, self.values, self.smooth, self.zones, self.gram, self.has_dark, self.strips,
+            self.first, self.cells, self.values, self.smooth, self.zones, self.gram, self.has_dark, self.uncovered,
             self.kept, self.counts, template, cell, found, edge,
         )  # fmt: skip
         return (found, edge) if is_measured else None
@@ -176,7 +176,7 @@ class Figures(NamedTuple):
 def fill_evidence(
     level_db: Floats32, seen: Floats32, smooth_db: Floats32, held: Floats32, side: int,
     first_of: Ints, all_cells: NDArray[np.int32], all_values: Bytes, all_smooth: Floats32, all_zones: Bytes,
-    grams: Floats, has_dark: Bools, all_strips: Bytes, all_kept: Floats, counts: Floats, template: Ints, cell: Ints,
+    grams: Floats, has_dark: Bools, all_uncovered: Bytes, all_kept: Floats, counts: Floats, template: Ints, cell: Ints,
     found: Floats, edge: Ints,
 ) -> bool:  # fmt: skip
     """Fill in `EVIDENCE` of templates on the parts of a patch that begin at some cells, shape (n, 11), and edges.
@@ -208,26 +208,26 @@ def fill_evidence(
                 for i in range(len(gram)):
                     for j in range(len(gram)):
                         gram[i, j] -= (STEP * values[n, i]) * (STEP * values[n, j])
-        c, dark, first, kinds = np.zeros(4), 1, 2, (len(products) - 2) // 2
+        c, work, dark, first, kinds = np.zeros(4), np.empty((4, 5)), 1, 2, (len(products) - 2) // 2
         # the design: with its dark parts where they are dark, with and without a shadow
-        plain, _ = least_squares(gram, products, total, np.array([0, first]), c)
+        plain, _ = least_squares(gram, products, total, (0, first), c, work)
         design, floor, beta, delta = plain, c[0], c[1], 0.0
         if has_dark[template[k]]:
-            with_dark, _ = least_squares(gram, products, total, np.array([0, first, dark]), c)
+            with_dark, _ = least_squares(gram, products, total, (0, first, dark), c, work)
             if c[2] < 0:
                 design, floor, beta, delta = with_dark, c[0], c[1], c[2]
         dz = products[dark] - gram[0, dark] / count * products[0]
         only_dark = total - (dz**2 / (gram[dark, dark] - gram[0, dark] ** 2 / count) if delta < 0 else 0.0)
-        shaded, _ = least_squares(gram, products, total, np.array([0, first, first + kinds]), c)
+        shaded, _ = least_squares(gram, products, total, (0, first, first + kinds), c, work)
         shaded = shaded if c[2] < 0 else plain
         both = min(design, shaded)
         if delta < 0 and shaded < plain:
-            with_both, _ = least_squares(gram, products, total, np.array([0, first, dark, first + kinds]), c)
+            with_both, _ = least_squares(gram, products, total, (0, first, dark, first + kinds), c, work)
             both = with_both if c[2] < 0 and c[3] < 0 else both
         # otherwise: the best of all figures
         other, other_plain = shaded, plain
         for q in range(first + 1, first + kinds):
-            shaded_q, plain_q = least_squares(gram, products, total, np.array([0, q, q + kinds]), c)
+            shaded_q, plain_q = least_squares(gram, products, total, (0, q, q + kinds), c, work)
             other_plain = min(other_plain, plain_q)
             other = min(other, shaded_q if c[2] < 0 else plain_q)
         # what is left next to the figure, farther out, and behind
@@ -254,12 +254,12 @@ def fill_evidence(
         plate, foam = math.log(shaded / both), math.log(max(only_dark, 1e-3) / design)
         found[k, 7] = math.sqrt(max(min(plate, foam), 0.0)) if delta < 0 else 0.0
         found[k, 8] = 0.0 if has_dark[template[k]] else 1.0
-        strips, kept = all_strips[begin:end], all_kept[template[k]]
+        uncovered, kept = all_uncovered[begin:end], all_kept[template[k]]
         if count < rows:
             kept = np.empty(kept.shape)
-            kept_sums(values, is_seen, strips, kept)
+            kept_sums(values, is_seen, uncovered, kept)
         whole = design if beta > 0 else only_dark
-        covered, best = least_covered(level, values, strips, kept, count, gram, only_dark, dz, delta < 0)
+        covered, best = least_covered(level, values, uncovered, kept, count, gram, only_dark, dz, delta < 0)
         if 0.5 * count * counts[COVERED] * math.log(max(whole / covered, 1.0)) > math.log(EDGES * len(OFFSETS)):
             edge[k] = best
         covered = min(covered, whole)
@@ -287,22 +287,22 @@ def products_of(level: Floats32, values: Bytes) -> Floats32:
 
 
 @compiled
-def kept_sums(values: Bytes, seen: Floats32, strips: Bytes, kept: Floats) -> None:
-    """Fill in sums of b, b^2 and b D over the cells of a figure up to each edge, shape (EDGES, offsets, 3)."""
+def kept_sums(values: Bytes, seen: Floats32, uncovered: Bytes, kept: Floats) -> None:
+    """Fill in sums of b, b^2 and b D over the cells of a figure up to each edge, shape (edges, 3)."""
     kept[:] = 0.0
     for n in range(len(values)):
         b = STEP * values[n, 2] * seen[n]
         if b > OUT:
-            for e in range(strips.shape[1]):
-                for strip in range(strips[n, e], kept.shape[1]):
-                    kept[e, strip, 0] += b
-                    kept[e, strip, 1] += b * b
-                    kept[e, strip, 2] += b * (STEP * values[n, 1])
+            for edge in range(len(kept)):
+                is_kept = uncovered[n, edge]
+                kept[edge, 0] += b * is_kept
+                kept[edge, 1] += b * b * is_kept
+                kept[edge, 2] += b * (STEP * values[n, 1]) * is_kept
 
 
 @compiled
 def least_covered(
-    level: Floats32, values: Bytes, strips: Bytes, kept: Floats, count: float, gram: Floats,
+    level: Floats32, values: Bytes, uncovered: Bytes, kept: Floats, count: float, gram: Floats,
     only_dark: float, dz: float, has_dark: bool,
 ) -> tuple[float, int]:  # fmt: skip
     """Least sum of squares that a figure leaves of which all beyond a straight edge is covered, and that edge.
@@ -311,25 +311,21 @@ def least_covered(
     ``R = R(floor, D) - (b^T z)^2 / b^T b``. ``only_dark`` is R(floor, D), ``dz`` the product of D, without its mean,
     and z.
     """
-    edges, offsets, _ = kept.shape
-    products = np.zeros((offsets + 1, edges), np.float32)
+    products = np.zeros(len(kept), np.float32)
     for n in range(len(level)):
         b_n = STEP * values[n, 2]
         if b_n > OUT:
-            bz = b_n * level[n]
-            for e in range(edges):
-                products[strips[n, e], e] += bz
+            bz_n = b_n * level[n]
+            for edge in range(len(products)):
+                products[edge] += bz_n * np.float32(uncovered[n, edge])
     dark_mean, dd, least, best = gram[0, 1] / count, gram[1, 1] - gram[0, 1] ** 2 / count, only_dark, -1
-    for e in range(edges):
-        bz = 0.0
-        for strip in range(offsets):
-            bz += products[strip, e]
-            b, bb, with_z = kept[e, strip, 0], kept[e, strip, 1] - kept[e, strip, 0] ** 2 / count, bz
-            if has_dark:
-                bd = kept[e, strip, 2] - b * dark_mean
-                bb, with_z = bb - bd**2 / dd, bz - bd * dz / dd
-            if bb > 0 and with_z > 0 and only_dark - with_z**2 / bb < least:
-                least, best = only_dark - with_z**2 / bb, e * offsets + strip
+    for edge in range(len(kept)):
+        b, bb, bz = kept[edge, 0], kept[edge, 1] - kept[edge, 0] ** 2 / count, float(products[edge])
+        if has_dark:
+            bd = kept[edge, 2] - b * dark_mean
+            bb, bz = bb - bd**2 / dd, bz - bd * dz / dd
+        if bb > 0 and bz > 0 and only_dark - bz**2 / bb < least:
+            least, best = only_dark - bz**2 / bb, edge
     return max(least, 1e-3), best
 
 
@@ -340,13 +336,15 @@ def along_edge(x_m: Floats, y_m: Floats, direction: int) -> Floats:
 
 
 @compiled
-def least_squares(gram: Floats, products: Floats32, total: float, at: Ints, c: Floats) -> tuple[float, float]:
+def least_squares(
+    gram: Floats, products: Floats32, total: float, at: tuple[int, ...], c: Floats, a: Floats
+) -> tuple[float, float]:
     """Sums of squares that the columns ``at`` leave, all of them and all but the last; fills in coefficients of all.
 
-    By elimination: with ``G = L D L^T`` and ``L y = products`` column i takes ``y_i^2 / D_i``.
+    ``a`` is room to work in, shape (4, 5). By elimination: with ``G = L D L^T`` and ``L y = products`` column i takes
+    ``y_i^2 / D_i``.
     """
     n, left, before = len(at), total, total
-    a = np.empty((n, n + 1))
     for i in range(n):
         for j in range(n):
             a[i, j] = gram[at[i], at[j]]

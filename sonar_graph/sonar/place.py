@@ -102,21 +102,21 @@ def fit_place(
     shade = shorter + np.float32(longer) * (longest - shorter)
     figure, dark = face + np.float32(side_m) * side_of, plate * (1 - shade)
     beta, delta, gamma = np.float32(0), np.float32(0), np.float32(0)
-    side, last, count = len(figure), len(level_db) - 1, np.float32(0)
+    last, count = len(level_db) - 1, np.float32(0)
     mean = np.float32(np.sum(level_db * seen) / max(np.sum(seen), 1.0))
+    along, across, M = np.zeros_like(figure), np.zeros_like(figure), np.empty((7, len(rows)), np.float32)
     for step in range(STEPS + 1):
         size, x0, y0 = 4 if step == 0 else 6, round(place[0]), round(place[1])
-        whole = beta * figure + delta * dark + gamma * shade
-        M = np.zeros((7, len(rows)), np.float32)
+        if step > 0:
+            slopes(beta * figure + delta * dark + gamma * shade, along, across)
         for n in range(len(rows)):
             i, j = rows[n], columns[n]
             x, y = x0 + i, y0 + j
             if 0 <= x <= last and 0 <= y <= last and seen[x, y] > 0:
-                before, after, left, right = max(i - 1, 0), min(i + 1, side - 1), max(j - 1, 0), min(j + 1, side - 1)
                 M[0, n], M[1, n], M[2, n], M[3, n] = 1, figure[i, j], dark[i, j], shade[i, j]
-                M[4, n] = (whole[before, j] - whole[after, j]) / np.float32(after - before)
-                M[5, n] = (whole[i, left] - whole[i, right]) / np.float32(right - left)
-                M[6, n] = level_db[x, y] - mean
+                M[4, n], M[5, n], M[6, n] = along[i, j], across[i, j], level_db[x, y] - mean
+            else:
+                M[:, n] = 0
         products = np.dot(M, M.T).astype(np.float64)
         count = products[0, 0]
         if count < LEAST_CELLS:
@@ -128,6 +128,19 @@ def fit_place(
             for a in range(2):
                 place[a] = (x0, y0)[a] + min(max(c[4 + a], -1.0), 1.0)
                 bound[a] = math.sqrt(variance * inverse[a])
+
+
+@compiled
+def slopes(picture: Floats32, along: Floats32, across: Floats32) -> None:
+    """Fill in by how much a picture falls from cell to cell, along its rows and along its columns."""
+    last = len(picture) - 1
+    for i in range(last + 1):
+        before, after = max(i - 1, 0), min(i + 1, last)
+        for j in range(last + 1):
+            along[i, j] = (picture[before, j] - picture[after, j]) / np.float32(after - before)
+        for j in range(1, last):
+            across[i, j] = (picture[i, j - 1] - picture[i, j + 1]) / np.float32(2)
+        across[i, 0], across[i, last] = picture[i, 0] - picture[i, 1], picture[i, last - 1] - picture[i, last]
 
 
 @compiled
