@@ -14,8 +14,9 @@ with a PNG file for each landmark::
     black_db = -8.0               # level of 0 ...
     white_db = 12.0               # ... and of 255; transparent pixels are floor
 
-A design is recognised by one connected figure about the middle of the square, brighter than the floor, with an area and
-length that `sonar_graph.sonar.cfar` accepts (0.008 to 0.2 m² and at most 0.7 m by default). Dark parts may lie apart.
+A design is recognised by one connected figure, brighter than the floor, with an area and length that
+`sonar_graph.sonar.cfar` accepts (0.008 to 0.2 m² and at most 0.7 m by default). Dark parts may lie apart. A landmark's
+place is the middle of the square, wherever in it the figure lies.
 Material beyond the square is cut off. The landmarks of the 2014 experiment were never published: these are ours.
 """
 
@@ -25,6 +26,7 @@ import hashlib
 import re
 import tomllib
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Any
@@ -48,6 +50,8 @@ MOST_PIXELS = 2000
 MOST_ID = 2**31 - 1
 LEAST_BRIGHT_DB = 3.0
 """Least level of the brightest part; below it a design does not stand out of the speckle of the floor."""
+CENTRED_M, JOINED_M = 0.0075, 0.05
+"""Distance from the middle up to which a figure counts as in it, and gap over which bright parts are one figure."""
 OWN_DESIGNS = "landmark designs"
 """Note of a log that names its landmarks, where they are not those that ship."""
 _Level = Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)]
@@ -85,6 +89,24 @@ class LandmarkDesign:
     def standing_m(self) -> float:
         """Height by which its bright parts stand over what is around them, at most its own."""
         return self.height_m if self.relief_m is None else min(self.relief_m, self.height_m)
+
+    @cached_property
+    def figure_m(self) -> tuple[float, float]:
+        """Centroid (x, y) of its largest bright part, of equal ones of that nearest to the middle.
+
+        There a candidate has its centre. Parts nearer to each other than `JOINED_M` are one, as `detection.closing_m`
+        joins them. (0, 0) where that is nearer to the middle than `CENTRED_M`.
+        """
+        pixel_m = self.size_m / len(self.mask)
+        is_bright = (np.nan_to_num(self.mask) >= LEAST_BRIGHT_DB).astype(np.uint8)
+        joined = cv2.morphologyEx(is_bright, cv2.MORPH_CLOSE, np.ones(2 * [round(JOINED_M / pixel_m) // 2 * 2 + 1]))
+        _, _, stats, centres = cv2.connectedComponentsWithStats(joined, connectivity=8)
+        areas = stats[1:, cv2.CC_STAT_AREA]
+        places_m = pixel_m * (centres[1:] - (len(self.mask) - 1) / 2) * [1.0, -1.0]
+        away_m = np.hypot(*places_m.T)
+        if not len(areas) or away_m[best := np.lexsort((away_m, -areas))[0]] < CENTRED_M:
+            return 0.0, 0.0
+        return float(places_m[best, 0]), float(places_m[best, 1])
 
     def level_db(self, x_m: Floats, y_m: Floats) -> Floats:
         """Level over the floor at points of the design's frame (origin at its centre); NaN outside."""

@@ -264,7 +264,10 @@ def estimate_confusion(
     if poor:
         matrix = np.where(is_known[:, None], matrix, confusion_for(designs).array())
     height_bias_m, error = without_height(fits)
-    found = accuracy(error, fits.bound_m, fits.track, Accuracy.of(shipped))
+    is_moved = fits.moved_m.any(axis=1) & np.isfinite(error).all(axis=1)
+    is_left_out = is_moved & (is_moved.sum() < np.isfinite(error).all(axis=1).sum())
+    counted = np.where(is_left_out[:, None], np.nan, error)  # these err by what moved them, too
+    found = accuracy(counted, fits.bound_m, fits.track, Accuracy.of(shipped))
     sigmas_m = np.hypot(found.sigmas_m(fits.bound_m), fits.moved_m)
     return Confusion(
         ids=ids,

@@ -29,13 +29,17 @@ from sonar_graph.sonar.templates import (
     ASSUMED_SLOPE,
     BLUR_RATIO,
     FINE,
+    HEADINGS,
     Blur,
     Floats32,
     Patch,
     PolarGrid,
     Templates,
+    middle_m,
 )
 
+HEADING_SIGMA_RAD = 2 * math.pi / HEADINGS / math.sqrt(3)
+"""Standard deviation of a heading, which is known to one step of the templates' headings to either side."""
 COARSE = 2
 """Cells between the places from which the search climbs to the best one."""
 MOST_MULTIPLICATIONS = 250_000
@@ -72,7 +76,7 @@ class DesignFit:
     template: Ints
     """Row of each design's template in `Templates`, shape (designs,)."""
     edge: Ints
-    """Edge beyond which each design is covered (`Figures.evidence`), -1: none, shape (designs,)."""
+    """Edge beyond which each design seems covered (`Figures.evidence`), -1: none, shape (designs,)."""
 
 
 class Search(NamedTuple):
@@ -128,35 +132,39 @@ class Appearance:
         if visible < params.least_visible or (found := self.figures.evidence(patch, template, cell)) is None:
             return None
         evidence, edge = found
-        centre_m = patch.centre_m + params.cell_m * (top - self._steps)
-        return DesignFit(evidence, visible, self.templates.heading_rad[template], centre_m, template, edge)
+        heading_rad = self.templates.heading_rad[template]
+        middles_m = [middle_m(*one) for one in zip(self._designs, heading_rad.tolist(), strict=True)]
+        centre_m = patch.centre_m + params.cell_m * (top - self._steps) + middles_m
+        return DesignFit(evidence, visible, heading_rad, centre_m, template, edge)
 
     def place(self, patch: Patch, fit: DesignFit, design: int, grazing_slope: float) -> tuple[Floats, Floats, Floats]:
-        """Place of a design that fits a patch, the bound of its standard deviations, and how far a cover moves it.
+        """Place of a design that fits a patch, the bound of its standard deviations, and by what else it may be off.
 
-        All are x and y on the floor, m. ``grazing_slope`` is the height of the sonar over the distance along the floor.
-        Only so many cells count for the bound as are independent. The last one leads from the place to that of the
-        uncovered part alone; 0 where nothing seems covered.
+        All are x and y on the floor, m, shapes (2,), (2,) and (2, 2). ``grazing_slope`` is the height of the sonar over
+        the distance along the floor. Only so many cells count for the bound as are independent. Where a part seems
+        covered, the place is that of the rest. What else: the way between the places with and without that part, and by
+        how much an error of the heading moves the middle of a design whose figure lies beside it.
         """
         cell_m, relief_m, origin = self.params.cell_m, self._designs[design].standing_m, self._rim + self._steps
         shadow_m = relief_m * (grazing_slope + 1 / grazing_slope)
         shade = min(shadow_m / cell_m * FINE / SHADE_FINE, LONGEST_SHADOW)
         drawn = row, steps = int(fit.template[design]), int(shade)
+        heading_rad, side = float(self.templates.heading_rad[row]), self.templates.side
         if drawn not in self._reliefs:
-            heading_rad, side = float(self.templates.heading_rad[row]), self.templates.side
             self._reliefs[drawn] = Relief.of(self._designs[design], heading_rad, side, cell_m, self._blur_m, steps)
-        start, side_m = (fit.centre_m[design] - patch.centre_m) / cell_m + origin, relief_m * grazing_slope
-        cells, relief, moved = self._compared, self._reliefs[drawn], np.zeros(2)
+        to_middle_m = middle_m(self._designs[design], heading_rad)
+        start = (fit.centre_m[design] - to_middle_m - patch.centre_m) / cell_m + origin
+        cells, relief, side_m, moved = self._compared, self._reliefs[drawn], relief_m * grazing_slope, np.zeros(2)
         place, bound = relief.place(patch.level_db, patch.seen, cells, start, side_m, shade - steps)
         if (edge := int(fit.edge[design])) >= 0:
-            x_m, y_m = (cell_m * (one - self.templates.side // 2) for one in cells)
-            is_kept = self.figures.is_kept(row, edge, x_m, y_m)
+            is_kept = self.figures.is_kept(row, edge, *(cell_m * (one - side // 2) for one in cells))
             kept = cells[0][is_kept], cells[1][is_kept]
             of_kept, bound_of_kept = relief.place(patch.level_db, patch.seen, kept, place, side_m, shade - steps)
             if np.isfinite(bound_of_kept).all():
-                moved = of_kept - place
+                moved, place, bound = cell_m * (of_kept - place), of_kept, bound_of_kept
         bound_m = cell_m / math.sqrt(self.figures.independent) * bound
-        return patch.centre_m + cell_m * (place - origin), bound_m, cell_m * moved
+        turned_m = HEADING_SIGMA_RAD * np.array([-to_middle_m[1], to_middle_m[0]])
+        return patch.centre_m + cell_m * (place - origin) + to_middle_m, bound_m, np.stack([moved, turned_m])
 
 
 def numbered_places(side: int) -> Ints:
@@ -300,8 +308,9 @@ class ObjectSighting:
     """Cramer-Rao bound of the standard deviations of the best design along the ray and across it, range times azimuth,
     shape (2,); None without a fit."""
     moved_m: Floats | None = None
-    """How far what seems to cover a part moves the place, along the ray and across it, shape (2,): 0 where nothing
-    does, None without a fit."""
+    """Standard deviations along the ray and across it that are added to those of the bound: the way by which what seems
+    to cover a part moves the place, and the error of the heading of a figure beside the middle. Shape (2,), 0 where
+    there is neither; None without a fit."""
 
 
 class Fitted(NamedTuple):
@@ -313,7 +322,7 @@ class Fitted(NamedTuple):
     bound_m: Floats
     """Cramer-Rao bound of its standard deviations, shape (2,)."""
     moved_m: Floats
-    """How far what seems to cover a part moves it, shape (2,)."""
+    """By what else it may be off (`Appearance.place`), shape (2, 2)."""
 
 
 @lru_cache(maxsize=64)
@@ -391,25 +400,27 @@ class CandidateFit:
         covariance, rise = np.zeros((len(fits), 2, 2)), np.zeros(len(fits))
         covariance[:, 0, 0], covariance[:, 1, 1] = CENTROID_SIGMA_M**2, (CENTROID_SIGMA_M / range_m) ** 2
         bounds: list[Floats | None] = [None] * len(fits)
-        moves: list[Floats | None] = [None] * len(fits)
+        sums: list[Floats | None] = [None] * len(fits)
         if fitted:
             rows = np.flatnonzero([fit is not None for fit in fits])
-            x, y = np.array([fit.centre_m for fit in fitted]).T
+            xy, bound, moves_m = (np.array([getattr(fit, name) for fit in fitted]) for name in Fitted._fields[1:])
             cos, sin = np.cos(bearing_rad[rows]), np.sin(bearing_rad[rows])
-            level_xy = np.array([cos * x - sin * y, sin * x + cos * y]).T
-            r, azimuth_rad[rows] = (view or SLANT_PLANE).range_azimuth(level_xy)
+            places = np.concatenate([xy[:, None], xy[:, None] + moves_m], axis=1)
+            level_xy = np.einsum("ijn,nkj->nki", np.array([[cos, -sin], [sin, cos]]), places)
+            r, azimuth = (one.reshape(-1, 3) for one in (view or SLANT_PLANE).range_azimuth(level_xy.reshape(-1, 2)))
+            off = np.stack([r - r[:, :1], r[:, :1] * (azimuth - azimuth[:, :1])], axis=-1)
+            moved, r, azimuth_rad[rows] = np.sqrt((off**2).sum(axis=1)), r[:, 0], azimuth[:, 0]
             rise[rows] = 0.0 if view is None else view.height_m / r
             range_m[rows] = r + model.height_bias_m * rise[rows]
-            away_m = np.hypot(x, y)
-            to_ray = np.array([away_m / r, r / away_m]).T
-            bound, moved = (to_ray * [getattr(fit, name) for fit in fitted] for name in ("bound_m", "moved_m"))
+            away_m = np.hypot(*xy.T)
+            bound = bound * np.array([away_m / r, r / away_m]).T
             of_place = model.range_azimuth_cov(bound, r)
             of_place[:, [0, 1], [0, 1]] += (moved / np.column_stack([np.ones_like(r), r])) ** 2
             covariance[rows] = np.minimum(of_place, covariance[rows])
             for row, *one in zip(rows.tolist(), bound, moved, strict=True):
-                bounds[row], moves[row] = one
+                bounds[row], sums[row] = one
         of = [None if fit is None else fit.of_designs for fit in fits]
-        columns = of, range_m.tolist(), azimuth_rad.tolist(), covariance, rise.tolist(), bounds, moves
+        columns = of, range_m.tolist(), azimuth_rad.tolist(), covariance, rise.tolist(), bounds, sums
         return [ObjectSighting(*row) for row in zip(*columns, strict=True)]
 
     def log_odds(self, sightings: Sequence[ObjectSighting | None]) -> Floats:

@@ -189,33 +189,33 @@ CELL_M = 0.005
 def check_candidates(designs: Iterable[LandmarkDesign], params: DetectionParams, search_m: float) -> None:
     """Refuse designs that can never be a candidate.
 
-    Only candidates are compared with designs, and a candidate is one connected bright region, compared at its centroid
-    and up to ``search_m`` beside it. So some bright part of a design must have the right size and lie about the middle
-    of its square. Parts are taken as `select_candidates` sees them in a perfect image without speckle.
+    Only candidates are compared with designs, and a candidate is one connected bright region, whose centroid is where
+    the design's figure is looked for, and up to ``search_m`` beside it. So some bright part of a design must have the
+    right size and lie about the middle of its figure (`LandmarkDesign.figure_m`). Parts are taken as
+    `select_candidates` sees them in a perfect image without speckle.
 
     Raises `CalibrationError` naming the design, its parts and the limits.
     """
-    reach_m = search_m + params.smoothing_m
     for design in designs:
         areas_m2, extents_m, offsets_m = bright_parts(design, params)
         is_sized = (areas_m2 >= params.min_area_m2) & (areas_m2 <= params.max_area_m2)
         is_sized &= extents_m <= params.max_extent_m
-        if (is_sized & (offsets_m <= reach_m)).any():
+        if (is_sized & (offsets_m <= search_m)).any():
             continue
         parts = ", ".join(
-            f"{area:.2g} m² with its centre {offset * 100:.0f} cm from the middle"
+            f"{area:.2g} m² with its centre {offset * 100:.0f} cm from that of the largest"
             for area, offset in zip(areas_m2, offsets_m, strict=True)
         )
         raise CalibrationError(
             f"landmark design {design.name} (id {design.id}) would never be found: its bright parts are "
             f"{parts or 'all smoothed away'}; one must have {params.min_area_m2:g} to {params.max_area_m2:g} m², be no "
-            f"longer than {params.max_extent_m:g} m and lie within {reach_m * 100:.0f} cm of the middle; "
+            f"longer than {params.max_extent_m:g} m and lie within {search_m * 100:.1f} cm of the largest; "
             "join the parts, change their size, or set detection.closing_m, min_area_m2, max_area_m2, max_extent_m"
         )
 
 
 def bright_parts(design: LandmarkDesign, params: DetectionParams) -> tuple[Floats, Floats, Floats]:
-    """Area, length and distance from the middle of each connected part over the floor, largest first."""
+    """Area, length and distance from the design's figure of each connected part over the floor, largest first."""
     half = int(np.ceil((design.size_m / 2 + params.smoothing_m + params.closing_m) / CELL_M))
     x_m, y_m = np.meshgrid(*2 * [CELL_M * np.arange(-half, half + 1)], indexing="ij")
     level_db = np.nan_to_num(design.level_db(x_m, y_m)).astype(np.float32)
@@ -227,5 +227,5 @@ def bright_parts(design: LandmarkDesign, params: DetectionParams) -> tuple[Float
     places.sort(key=lambda place: -place.shape[1])
     areas = np.array([place.shape[1] * CELL_M**2 for place in places])
     extents = np.array([np.sqrt(12 * np.linalg.eigvalsh(np.cov(place, bias=True)).max()) for place in places])
-    offsets = np.array([np.linalg.norm(place.mean(axis=1)) for place in places])
+    offsets = np.array([np.linalg.norm(place.mean(axis=1) - design.figure_m) for place in places])
     return areas, extents, offsets

@@ -26,6 +26,7 @@ from sonar_graph.sonar.confusion import Confusion, confusion_for
 from sonar_graph.sonar.frame_check import FrameCheck, check_block
 from sonar_graph.sonar.geometry import FloorView
 from sonar_graph.sonar.regions import Candidates, CandidateVerdict
+from sonar_graph.sonar.templates import check_headings
 from sonar_graph.sonar.tracker import Association, SonarStep, Tracker, TrackingParams
 
 
@@ -134,6 +135,7 @@ class Recogniser:
         self.ids = np.array([design.id for design in self.designs])
         self.confusion.check_designs(self.designs)
         check_candidates(self.designs, self.params.detection, self.params.appearance.search_m)
+        check_headings(self.designs)
         self._calibration = calibration
         opening_rad = calibration.sonar.elevation_aperture_rad
         self._look = CandidateFit(self.designs, self.params.appearance, self.confusion, opening_rad)

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonar_graph.devices import LandmarkDesign
+from sonar_graph.errors import CalibrationError
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.numerics import compiled, inlined
 from sonar_graph.sonar.geometry import FloorView
@@ -46,6 +47,8 @@ SEARCHED_DARK = 0.5
 """Share of the dark parts' level in the templates of the search: a plate may be as its design or not be seen."""
 SAME_SHARE = 0.05
 """Largest squared difference of headings that share a template, as a share of their variance."""
+TURNED_RAD, CHECKED_CELL_M = math.radians(30.0), 0.01
+"""Least turn after which designs must look otherwise (`check_headings`), and the cells in which that is seen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,11 +134,15 @@ def with_side(power: Floats32, width: int) -> Floats32:
 def echo_power(
     design: LandmarkDesign, heading_rad: float, side: int, cell_m: float, stretch: tuple[float, float] = (1.0, 1.0)
 ) -> tuple[Floats32, Floats32]:
-    """Power of the echo of a design's bright parts and of all of it, not blurred, over `FINE` points a cell."""
+    """Power of the echo of a design's bright parts and of all of it, not blurred, over `FINE` points a cell.
+
+    Its figure lies in the middle (`LandmarkDesign.figure_m`), and is stretched about it.
+    """
     fine_m = cell_m / FINE * (np.arange(side * FINE) - side * FINE / 2 + 0.5)
     x_m, y_m = np.meshgrid(fine_m, fine_m, indexing="ij")
     cos, sin = math.cos(heading_rad), math.sin(heading_rad)
-    level = design.level_db((cos * x_m + sin * y_m) / stretch[0], (-sin * x_m + cos * y_m) / stretch[1])
+    (x0, y0), (x_share, y_share) = design.figure_m, stretch
+    level = design.level_db(x0 + (cos * x_m + sin * y_m) / x_share, y0 + (-sin * x_m + cos * y_m) / y_share)
     level = np.nan_to_num(level).astype(np.float32)
     bright, whole = (np.asarray(10 ** (one / 10), np.float32) for one in (np.maximum(level, 0), level))
     return bright, whole
@@ -164,12 +171,44 @@ def of_cells(fine: Floats32) -> Floats32:
 
 
 def material_radius_m(design: LandmarkDesign) -> float:
-    """Distance from the centre to the farthest point with material."""
+    """Distance from the middle of its figure to the farthest point with material."""
     pixels = len(design.mask)
     middles_m = ((np.arange(pixels) + 0.5) / pixels - 0.5) * design.size_m
     y_m, x_m = np.meshgrid(-middles_m, middles_m, indexing="ij")
     there = np.isfinite(design.mask)
-    return float(np.hypot(x_m, y_m)[there].max(initial=design.size_m / 4))
+    x0, y0 = design.figure_m
+    return float(np.hypot(x_m - x0, y_m - y0)[there].max(initial=design.size_m / 4))
+
+
+def middle_m(design: LandmarkDesign, heading_rad: float) -> Floats:
+    """Way on the grid from the middle of a design's figure to the middle of its square, shape (2,)."""
+    (x, y), cos, sin = design.figure_m, math.cos(heading_rad), math.sin(heading_rad)
+    return -np.array([cos * x - sin * y, sin * x + cos * y])
+
+
+def check_headings(designs: Sequence[LandmarkDesign]) -> None:
+    """Refuse designs of which nothing tells where the middle of their square is.
+
+    A figure beside it that looks the same turned by `TURNED_RAD` and more, with its dark parts, may belong to several
+    middles. Raises `CalibrationError` naming the design.
+    """
+    for design in designs:
+        if design.figure_m == (0.0, 0.0):
+            continue
+        side = 2 * math.ceil(material_radius_m(design) / CHECKED_CELL_M) + 1
+        first, *turned = (
+            drawn(design, 2 * math.pi * k / HEADINGS, side, CHECKED_CELL_M, (CHECKED_CELL_M, CHECKED_CELL_M))
+            for k in range(HEADINGS)
+        )
+        off = [float(np.mean((sum(one) - sum(first)) ** 2)) for one in turned]
+        least = round(TURNED_RAD * HEADINGS / (2 * math.pi))
+        if min(off[least - 1 : -least + 1 or None]) < SAME_SHARE * float(np.var(sum(first))):
+            away_cm = 100 * math.hypot(*design.figure_m)
+            raise CalibrationError(
+                f"landmark design {design.name} (id {design.id}): its figure lies {away_cm:.0f} cm from the middle of "
+                "its square and looks the same when it is turned, so that nothing tells where the middle is; "
+                "draw it in the middle"
+            )
 
 
 _STEPS_A_BEAM = 4

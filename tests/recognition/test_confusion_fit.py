@@ -178,6 +178,28 @@ def _fits(per_class: int, noise: float, seed: int = 0, scale: float = 1.0) -> co
     )
 
 
+def test_what_a_cover_moves_is_no_part_of_the_usual_sigma():
+    """A quarter of the landmarks' sightings errs by 5 cm more, and says so; where all do, all count."""
+    fits, rng = _fits(200, 1.0), np.random.default_rng(2)
+    is_landmark = fits.label < 2
+    is_covered = is_landmark & (rng.random(len(fits.label)) < 0.25)
+    moved = np.where(is_covered[:, None], 0.05, 0.0)
+    hidden = replace(fits, error_m=fits.error_m + moved * rng.choice([-1, 1], moved.shape))
+    plain, told, untold = (
+        confusion_fit.estimate_confusion(one, (5, 3), {})
+        for one in (replace(fits, error_m=np.where(is_covered[:, None], np.nan, fits.error_m)),
+                    replace(hidden, moved_m=moved), hidden)
+    )  # fmt: skip
+    assert (told.range_sigma_m, told.across_sigma_m) == pytest.approx(
+        (plain.range_sigma_m, plain.across_sigma_m), rel=0.1
+    )
+    assert untold.across_sigma_m > 4 * told.across_sigma_m
+    everywhere = replace(hidden, moved_m=np.where(is_landmark[:, None], 0.01, 0.0))
+    assert confusion_fit.estimate_confusion(everywhere, (5, 3), {}).across_sigma_m == pytest.approx(
+        untold.across_sigma_m
+    )
+
+
 def _posteriors(fits: confusion_fit.LabelledFits, model: Confusion) -> np.ndarray:
     sums, counted, _, _ = confusion_fit.track_sums(fits)
     odds = np.pad(model.log_odds(sums), ((0, 0), (0, 1)))

@@ -59,10 +59,15 @@ def _fit(
 
 
 def half_plane() -> LandmarkDesign:
-    """10 dB of material on the side of positive x."""
+    """10 dB of material on the side of positive x, drawn about the middle of its edge, not about that of its figure."""
     mask = np.full((200, 200), np.nan)
     mask[:, 100:] = 10.0
-    return LandmarkDesign(1, "half", 1.0, mask, relief_m=0.0)
+    return edge_in_the_middle(LandmarkDesign(1, "half", 1.0, mask, relief_m=0.0))
+
+
+def edge_in_the_middle(design: LandmarkDesign) -> LandmarkDesign:
+    vars(design)["figure_m"] = (0.0, 0.0)
+    return design
 
 
 def places_m(templates: Templates) -> Floats:
@@ -84,7 +89,7 @@ def test_the_power_of_an_edge_is_blurred_by_the_pulse_away_from_the_sonar_and_by
 def test_foam_that_stands_up_shows_its_near_side_over_the_first_centimetres_of_its_face():
     """2 cm of foam at a slope of tan 30 degrees: 12 mm of its near edge and their blur are brighter, no other edge."""
     flush = half_plane()
-    raised = replace(flush, height_m=0.02, relief_m=0.02)
+    raised = edge_in_the_middle(replace(flush, height_m=0.02, relief_m=0.02))
     for heading_rad in (0.0, np.pi, np.pi / 2):
         before, after = (picture_of(one, heading_rad, 151, 0.004, (1e-3, 1e-3))[0] for one in (flush, raised))
         brighter_mm = 4 * (after - before).sum(axis=0) / (10 * np.log10(1 + np.sqrt(3) ** 3))
@@ -127,7 +132,7 @@ def test_cells_are_those_of_a_disc_with_a_margin_around_the_largest_design_but_f
 
 def test_material_ends_where_the_mask_ends_and_headings_that_look_alike_are_one_template_of_each_design():
     mask = np.full((100, 100), np.nan)
-    mask[50, 80] = 3.0
+    mask[45:55, 45:55], mask[50, 80] = 12.0, 3.0
     assert material_radius_m(LandmarkDesign(1, "dot", 1.0, mask)) == pytest.approx(np.hypot(0.305, 0.005), abs=1e-9)
     disc, square = DEFAULT_DESIGNS[:2]
     twin = LandmarkDesign(9, "twin", disc.size_m, disc.mask)
