@@ -71,7 +71,7 @@ def label(
             lambda done: progress("drawing frames", done, 0),
         )
     if not frames:
-        raise LogError(no_images(log))
+        raise LogError(no_images(log, reading.window))
     desk = LabelDesk(frames, labels, path)
     with LabelServer(
         desk, lambda nonce: page_of(log, path, known, desk, nonce), [one.id for one in known], port

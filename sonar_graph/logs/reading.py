@@ -163,7 +163,7 @@ def read_log(
         given = calibration.values if isinstance(calibration, PartialCalibration) else {}
         recorded = None if isinstance(calibration, Calibration) else read_calibration(recording)
         if late_ns > 0 and "start" not in given and recorded is not None and "start" in recorded.model_fields_set:
-            sequence.notes["log.start"] = (
+            sequence.notes["log.start_pose"] = (
                 f"the start pose that it states is of its beginning, {late_ns * 1e-9:.3f} s before the part that was "
                 "read; give the pose there as [start] position_m and rpy_rad in a file for --calibration"
             )

@@ -84,7 +84,7 @@ def read_images_alone(
         recording.require_sound()
     first = next(read_sonar_frames(path, topic, config, window=window, salvage=salvage, refused=_passed_over), None)
     if first is None:
-        raise LogError(no_images(path))
+        raise LogError(no_images(path, window))
     recorded = read_calibration(recording)
     is_stated = SONAR in mounted_by(recorded.model_dump(exclude_unset=True) if recorded else {})
     is_stated |= calibration is not None and SONAR in mounted_by(calibration.values)
@@ -145,8 +145,10 @@ def _passed_over(_stamp_ns: int, _reason: str) -> None:
     """Messages that are no images are named when the frames are used."""
 
 
-def no_images(log: Path | str) -> str:
-    """Message for a log without sonar images."""
+def no_images(log: Path | str, window: TimeWindow | None = None) -> str:
+    """Message for a log without sonar images, or without any in a part of it."""
+    if window is not None and (window.start or window.end):
+        return f"{log}: has no sonar images between --start and --end; leave them out to use the whole log"
     return (
         f"{log}: has no sonar images; `sonar-graph inspect {log}` lists what it has "
         "(`sonar-graph compare` and read_log need none)"

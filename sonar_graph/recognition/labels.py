@@ -117,7 +117,10 @@ def read_labels(path: Path, log: Path) -> Labels:
         hint = "; angles are in rad, and these seem to be in degrees" if "azimuth_rad: expected" in str(error) else ""
         raise CalibrationError(f"{error}{hint}") from error
     if labels.log != spelt(log.name):
-        raise CalibrationError(f"{path}: its labels are of {labels.log}, not of {log.name}; name the log they are of")
+        raise CalibrationError(
+            f"{path}: its labels are of {labels.log}, not of {log.name}; name the log they are of, or, if it is the "
+            f"same one under another name, write that as `log` in {path.name}"
+        )
     return labels
 
 

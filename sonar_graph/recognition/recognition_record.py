@@ -25,6 +25,7 @@ LEAST_NAMED = 0.5
 """Posterior above which a detection counts as naming a landmark."""
 
 NO_FLOOR = "frame without a known floor: compared with the designs in the plane of the image"
+CANDIDATE_OFF_FLOOR = "candidate rejected: off floor"
 OFF_FLOOR = "frame in which no floor can be: by mounting and tilt the sonar looks past it"
 LACKS = "detections.floor"
 """Note of what is lacking for a known floor."""
@@ -95,18 +96,23 @@ class Recognition:
                 f"Warning: in {self.outcomes[OFF_FLOOR]} of {self.frames} frames the sonar looks past the floor: check "
                 "[sonar.mounting] (a positive pitch turns it down), [floor] and sonar.elevation_aperture_rad"
             )
-        if true_landmarks is not None and looked_for:
-            unknown = sorted(set(true_landmarks.ids.tolist()) - looked_for)
-            if unknown:
-                listed = ", ".join(map(str, unknown))
-                lines.append(f"Warning: the log has landmarks {listed}, of which there is no design; give --designs")
+        judged = sum(count for outcome, count in self.outcomes.items() if outcome.startswith("candidate rejected"))
+        if not counts and judged >= FEWEST_TRACKS and 2 * self.outcomes[CANDIDATE_OFF_FLOOR] > judged:
+            lines.append(
+                f"Warning: {self.outcomes[CANDIDATE_OFF_FLOOR]} of {judged} rejected candidates lie where no floor can "
+                "be: check [floor], the depth, and [sonar.mounting]"
+            )
+        unknown = sorted(set(true_landmarks.ids.tolist()) - looked_for) if true_landmarks and looked_for else []
+        if unknown:
+            listed = ", ".join(map(str, unknown))
+            lines.append(f"Warning: the log has landmarks {listed}, of which there is no design; give --designs")
         outside, tracks = self.unlike
         if tracks >= FEWEST_TRACKS and 2 * outside > tracks:
             lines.append(
                 f"Warning: {outside} of {tracks} tracks lie on a floor rougher or smoother than where the model was "
                 "measured (1 in 20 is usual): check sonar.image (scale, decibel_span, full_scale), or use `calibrate`"
             )
-        if (line := self.unlike_the_model()) is not None:
+        if not unknown and (line := self.unlike_the_model()) is not None:
             lines += [line, SEE_TRACKS]
         return lines
 

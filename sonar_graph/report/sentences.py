@@ -53,6 +53,7 @@ SAID_NOTES = {
     "log.ending": "Log",
     "log.damage": "Log",
     "log.start": "Log",
+    "log.start_pose": WARNING,
     FITTED: "Truth",
     HEIGHTS: "Truth",
     "log.stamps": "Log",

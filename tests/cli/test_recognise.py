@@ -148,6 +148,14 @@ def test_label_ends_with_a_command_that_has_the_options_that_it_was_given(lane_l
     assert f"Next: sonar-graph calibrate {lane_log} --labels {labels} --designs {designs} -o model.json" in said
 
 
+def test_label_says_whether_a_log_or_a_part_of_it_has_no_images(lane, lane_log, run, tmp_path, capsys):
+    assert run("label", lane_log, "-o", tmp_path / "labels.json", "--start", "3600", "--no-browser") == 2
+    assert f"{lane_log}: has no sonar images between --start and --end" in capsys.readouterr().err
+    write_log(blind := tmp_path / "blind.mcap", lane.sequence)
+    assert run("label", blind, "-o", tmp_path / "labels.json", "--no-browser") == 2
+    assert f"{blind}: has no sonar images; `sonar-graph inspect" in capsys.readouterr().err
+
+
 def test_labels_take_the_place_of_a_truth_and_mistakes_with_them_are_named(lane, lane_log, run, tmp_path, capsys):
     model, given = tmp_path / "model.json", tmp_path / "labels.json"
     stamp_ns = int(lane.frames.stamps_ns[40])

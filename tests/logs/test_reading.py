@@ -332,7 +332,7 @@ def test_a_start_pose_of_the_logs_beginning_is_said_to_be_of_another_instant(lon
         ({"window": TimeWindow(end=Instant.parse("2"))}, False),
         ({"window": TimeWindow(Instant.parse("0"))}, False),
     ):
-        said = read_log(long[1], **settings).notes.get("log.start", "")
+        said = read_log(long[1], **settings).notes.get("log.start_pose", "")
         pattern = r"of its beginning, 2\.000 s before .*\[start\] position_m and rpy_rad .*--calibration"
         assert bool(re.search(pattern, said)) == bool(said) == is_told
 

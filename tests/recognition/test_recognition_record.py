@@ -4,7 +4,15 @@ from pathlib import Path
 
 import pytest
 
-from sonar_graph.recognition.recognition_record import DrawnFrame, Recognition, read_recognition, write_recognition
+from sonar_graph.recognition.recognition_record import (
+    CANDIDATE_OFF_FLOOR,
+    DrawnFrame,
+    Recognition,
+    read_recognition,
+    write_recognition,
+)
+from sonar_graph.sonar.recogniser import REJECTED
+from sonar_graph.sonar.regions import CandidateVerdict
 
 JPEG = b"\xff\xd8 a picture \xff\xd9"
 
@@ -58,3 +66,17 @@ def test_a_floor_of_another_roughness_is_told_where_most_of_ten_tracks_show_it(r
     lines = [line for line in replace(recognition, unlike=unlike).naming() if "rougher or smoother" in line]
     assert len(lines) == is_doubted
     assert all(line.startswith("Warning: 6 of 10 tracks") for line in lines)
+
+
+@pytest.mark.parametrize(("off", "other", "is_doubted"), [(60, 40, True), (40, 60, False), (9, 0, False)])
+def test_a_wrong_floor_is_doubted_where_nothing_is_named_and_most_candidates_lie_off_it(
+    recognition, off, other, is_doubted
+):
+    outcomes = Counter({CANDIDATE_OFF_FLOOR: off, "candidate rejected: too small": other})
+    lines = [line for line in replace(recognition, outcomes=outcomes).naming() if "where no floor can be" in line]
+    assert len(lines) == is_doubted
+    assert all(line.startswith("Warning: 60 of 100 rejected candidates") for line in lines)
+
+
+def test_the_words_of_a_candidate_off_the_floor_are_those_of_the_recogniser():
+    assert REJECTED[CandidateVerdict.OFF_FLOOR] == CANDIDATE_OFF_FLOOR

@@ -13,6 +13,7 @@ from sonar_graph.recognition.session import RecognitionSession
 from sonar_graph.recognition.track_stories import MOST_EXAMPLES, TrackStories
 from sonar_graph.report.tracks.track_page import write_track_page
 from sonar_graph.sonar.recogniser import Recogniser
+from sonar_graph.states import LandmarkMap
 from tests.recognition.imaged_lane import Lane
 
 NAMES = ["1: disc", "2: square", "3: triangle", "4: cross"]
@@ -98,3 +99,10 @@ def test_images_of_which_nearly_all_tracks_are_none_are_doubted(told, count, non
     if doubts:
         assert doubts[0].startswith(f"Warning: {none} of {count} tracks are of no landmark")
     assert told[0].unlike_the_model() is None
+
+
+def test_a_log_of_other_landmarks_is_the_only_reason_given_for_tracks_of_none(told):
+    others = LandmarkMap(np.array([11, 12]), np.zeros((2, 3)), np.full((2, 3, 3), np.nan))
+    lines = of_tracks(told[0], 20, 20).naming(others)
+    assert any("the log has landmarks 11, 12, of which there is no design" in line for line in lines)
+    assert not any("may be unlike" in line for line in lines)

@@ -387,7 +387,9 @@ def test_of_a_logs_notes_the_doubts_are_said_and_gaps_and_unlikely_numbers_are_w
     said = {subject: f"<{subject}>" for subject in sentences.SAID_NOTES}
     notes = said | {"log.topics": "imu: /imu", "log.noise": "dvl"}
     assert [line.partition(": ")[2] for line in sentences.doubt_lines(notes)] == list(said.values())
-    assert sentences.warning_lines(notes) == [f"Warning: <log.{name}>" for name in ("sensors", "warnings", "gaps")]
+    assert sentences.warning_lines(notes) == [
+        f"Warning: <log.{name}>" for name in ("sensors", "start_pose", "warnings", "gaps")
+    ]
 
 
 def test_a_line_names_sensor_stamp_reason_distance_and_runs():
