@@ -108,6 +108,8 @@ class Appearance:
         self.patch_side = self.figures.patch_side
         self._rim = (self.patch_side - templates.side) // 2 - self._steps
         self._designs, self._blur_m = tuple(designs), blur_m
+        drawn = zip(templates.design.tolist(), templates.heading_rad.tolist(), strict=True)
+        self._to_middle_m = np.array([middle_m(designs[index], heading_rad) for index, heading_rad in drawn])
         self._compared = x, y = np.divmod(templates.cells, templates.side)
         self._reliefs: dict[tuple[int, int], Relief] = {}
         pictures = templates.pictures
@@ -132,10 +134,8 @@ class Appearance:
         if visible < params.least_visible or (found := self.figures.evidence(patch, template, cell)) is None:
             return None
         evidence, edge = found
-        heading_rad = self.templates.heading_rad[template]
-        middles_m = [middle_m(*one) for one in zip(self._designs, heading_rad.tolist(), strict=True)]
-        centre_m = patch.centre_m + params.cell_m * (top - self._steps) + middles_m
-        return DesignFit(evidence, visible, heading_rad, centre_m, template, edge)
+        centre_m = patch.centre_m + params.cell_m * (top - self._steps) + self._to_middle_m[template]
+        return DesignFit(evidence, visible, self.templates.heading_rad[template], centre_m, template, edge)
 
     def place(self, patch: Patch, fit: DesignFit, design: int, grazing_slope: float) -> tuple[Floats, Floats, Floats]:
         """Place of a design that fits a patch, the bound of its standard deviations, and by what else it may be off.
@@ -149,10 +149,10 @@ class Appearance:
         shadow_m = relief_m * (grazing_slope + 1 / grazing_slope)
         shade = min(shadow_m / cell_m * FINE / SHADE_FINE, LONGEST_SHADOW)
         drawn = row, steps = int(fit.template[design]), int(shade)
-        heading_rad, side = float(self.templates.heading_rad[row]), self.templates.side
+        side, to_middle_m = self.templates.side, self._to_middle_m[row]
         if drawn not in self._reliefs:
+            heading_rad = float(self.templates.heading_rad[row])
             self._reliefs[drawn] = Relief.of(self._designs[design], heading_rad, side, cell_m, self._blur_m, steps)
-        to_middle_m = middle_m(self._designs[design], heading_rad)
         start = (fit.centre_m[design] - to_middle_m - patch.centre_m) / cell_m + origin
         cells, relief, side_m, moved = self._compared, self._reliefs[drawn], relief_m * grazing_slope, np.zeros(2)
         place, bound = relief.place(patch.level_db, patch.seen, cells, start, side_m, shade - steps)
