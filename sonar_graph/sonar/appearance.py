@@ -400,7 +400,7 @@ class CandidateFit:
         covariance, rise = np.zeros((len(fits), 2, 2)), np.zeros(len(fits))
         covariance[:, 0, 0], covariance[:, 1, 1] = CENTROID_SIGMA_M**2, (CENTROID_SIGMA_M / range_m) ** 2
         bounds: list[Floats | None] = [None] * len(fits)
-        sums: list[Floats | None] = [None] * len(fits)
+        moves: list[Floats | None] = [None] * len(fits)
         if fitted:
             rows = np.flatnonzero([fit is not None for fit in fits])
             xy, bound, moves_m = (np.array([getattr(fit, name) for fit in fitted]) for name in Fitted._fields[1:])
@@ -418,9 +418,9 @@ class CandidateFit:
             of_place[:, [0, 1], [0, 1]] += (moved / np.column_stack([np.ones_like(r), r])) ** 2
             covariance[rows] = np.minimum(of_place, covariance[rows])
             for row, *one in zip(rows.tolist(), bound, moved, strict=True):
-                bounds[row], sums[row] = one
+                bounds[row], moves[row] = one
         of = [None if fit is None else fit.of_designs for fit in fits]
-        columns = of, range_m.tolist(), azimuth_rad.tolist(), covariance, rise.tolist(), bounds, sums
+        columns = of, range_m.tolist(), azimuth_rad.tolist(), covariance, rise.tolist(), bounds, moves
         return [ObjectSighting(*row) for row in zip(*columns, strict=True)]
 
     def log_odds(self, sightings: Sequence[ObjectSighting | None]) -> Floats:
