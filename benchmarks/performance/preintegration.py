@@ -36,8 +36,8 @@ from common import make_parser, print_figures, print_table
 
 from sonar_graph.measurements import Dvl, Floats, Imu
 from sonar_graph.navigation import JointPreintegrator
-from sonar_graph.slam.models import OdometryWithBias
-from sonar_graph.slam.models.inertial_factors import doppler_odometry, inertial_doppler_odometry
+from sonar_graph.slam.inertial_factors import doppler_odometry, inertial_doppler_odometry
+from sonar_graph.slam.odometry_factor import OdometryWithBias
 
 NS = 1_000_000_000
 IMU_HZ, DVL_HZ = 200, 5

@@ -27,12 +27,12 @@ from sonar_graph import Calibration, Odometry
 from sonar_graph.calibration import Section
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Depth, Dvl, Floats, Imu, LandmarkDetections, Measurements
+from sonar_graph.models.identity import ACCEPTED, MINIMUM_PROBABILITY, identify
+from sonar_graph.models.sonar import elevation_on_floor, locate
 from sonar_graph.motion import MotionSource, PreintegratedMotion
 from sonar_graph.navigation import JointPreintegrator
 from sonar_graph.navigation.joint_preintegration import DopplerRule
-from sonar_graph.slam import Isam2
-from sonar_graph.slam.landmarks.association import ACCEPTED, MINIMUM_PROBABILITY, identify
-from sonar_graph.slam.models import elevation_on_floor, factors, locate
+from sonar_graph.slam import Isam2, factors
 from sonar_graph.states import (
     OUTCOME_NUMBERS,
     CausalEstimates,

@@ -52,8 +52,8 @@ from sonar_graph.navigation.alignment import (
 )
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import BasinOptions, simulate_basin
-from sonar_graph.slam.models import factors
-from sonar_graph.slam.models.inertial_factors import doppler_odometry, inertial_doppler_odometry
+from sonar_graph.slam import factors
+from sonar_graph.slam.inertial_factors import doppler_odometry, inertial_doppler_odometry
 
 RATES_HZ = (1.0, 2.0, 5.0, 10.0)
 WAYS = ("linear", "inertial", "small gap_s")

@@ -10,7 +10,7 @@ from gtsam.symbol_shorthand import B, V, X
 
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation import JointPreintegrator
-from sonar_graph.slam.models.inertial_factors import doppler_odometry, inertial_doppler_odometry
+from sonar_graph.slam.inertial_factors import doppler_odometry, inertial_doppler_odometry
 
 NS = 1_000_000_000
 GRAVITY = np.array([0.0, 0.0, -9.81])

@@ -1,6 +1,6 @@
 """Motion and its covariance from inertial and Doppler samples, roll, pitch and biases at the start; no landmarks.
 
-For use in any GTSAM program: docs/tutorials/05_preintegration.py; factors: `sonar_graph.slam.models.inertial_factors`.
+For use in any GTSAM program: docs/tutorials/05_preintegration.py; factors: `sonar_graph.slam.inertial_factors`.
 """
 
 # fmt: off

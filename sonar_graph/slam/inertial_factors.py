@@ -20,7 +20,7 @@ With the motion corrected to first order by these parameters, ``t`` its duration
     ds    = R_i^T (d_j - d_i) - s                            d: the Doppler log
 
 Both are Python callbacks around compiled arithmetic; GTSAM has no compiled factor with these rows. Where no bias is to
-be estimated, `sonar_graph.slam.models.factors.odometry` makes of ``motion.relative_pose()`` a compiled one.
+be estimated, `sonar_graph.slam.factors.odometry` makes of ``motion.relative_pose()`` a compiled one.
 """
 
 import gtsam
@@ -31,7 +31,7 @@ from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Floats
 from sonar_graph.navigation import DISPLACEMENT, ROTATION, JointMotion, finite_vector
 from sonar_graph.numerics import compiled, cross_matrix, left_jacobian, rotation_exp
-from sonar_graph.slam.models.factors import gaussian
+from sonar_graph.slam.factors import gaussian
 
 BIAS_ORDER = np.r_[3:6, 0:3]
 """GTSAM's bias has the accelerometers first."""
