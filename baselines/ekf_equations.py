@@ -27,8 +27,7 @@ import numpy as np
 from baselines.event_order import Motion
 from baselines.sonar_update import GATED, Gate, SonarModel, admit, correction, far_view, polar_covariance
 from sonar_graph.measurements import Floats
-from sonar_graph.models.aiding import doubted, yaw_and_derivative
-from sonar_graph.models.sonar import FLOOR_GATE, sonar_point, sonar_point_jacobian, wrap_angle
+from sonar_graph.models import FLOOR_GATE, doubted, sonar_point, sonar_point_jacobian, wrap_angle, yaw_and_derivative
 from sonar_graph.numerics import (
     I3,
     LOWER_LEFT,

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonar_graph.measurements import Floats, Ints
-from sonar_graph.models.identity import ACCEPTED
+from sonar_graph.models import ACCEPTED
 from sonar_graph.motion import Motions
 from sonar_graph.navigation.alignment import up_direction
 from sonar_graph.numerics import I3, LOWER_LEFT, ZERO, compiled, cross, exp_and_mean, mat, store, vec

@@ -50,9 +50,17 @@ import numpy as np
 from baselines.event_order import Motion
 from baselines.sonar_update import SonarModel, correction
 from sonar_graph.measurements import Floats
-from sonar_graph.models.aiding import yaw_and_derivative
-from sonar_graph.models.biases import ACCEL, BIASES, COMPASS, SCALE, by_biases
-from sonar_graph.models.sonar import project, sonar_point, sonar_point_jacobian
+from sonar_graph.models import (
+    ACCEL,
+    BIASES,
+    COMPASS,
+    SCALE,
+    by_biases,
+    project,
+    sonar_point,
+    sonar_point_jacobian,
+    yaw_and_derivative,
+)
 from sonar_graph.numerics import compiled, exp_and_mean, store, vec
 
 THETA, BETA, BODY = slice(0, 3), slice(3, 3 + BIASES), slice(3 + BIASES, 6 + BIASES)

@@ -11,8 +11,7 @@ import numpy as np
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Floats, Ints
-from sonar_graph.models.identity import gate_threshold
-from sonar_graph.models.sonar import elevation_on_floor
+from sonar_graph.models import elevation_on_floor, gate_threshold
 from sonar_graph.numerics import compiled
 from sonar_graph.states import OUTCOME_NUMBERS, Outcome
 

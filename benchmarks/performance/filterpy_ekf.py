@@ -17,8 +17,15 @@ from filterpy.kalman import ExtendedKalmanFilter
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import NS_PER_S, Floats, Ints
-from sonar_graph.models.identity import ACCEPTED, MINIMUM_PROBABILITY, identify
-from sonar_graph.models.sonar import FLOOR_GATE, elevation_on_floor, locate_jacobians, range_azimuth_jacobians
+from sonar_graph.models import (
+    ACCEPTED,
+    FLOOR_GATE,
+    MINIMUM_PROBABILITY,
+    elevation_on_floor,
+    identify,
+    locate_jacobians,
+    range_azimuth_jacobians,
+)
 from sonar_graph.motion import PreintegratedMotion
 from sonar_graph.navigation import Odometry
 from sonar_graph.navigation.alignment import gravity_direction

@@ -28,8 +28,7 @@ from common import conclude, make_parser, note, print_table
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import LandmarkDetections, Measurements
-from sonar_graph.models.biases import BIASES, bias_sigmas, by_biases
-from sonar_graph.models.sonar import elevation_on_floor, locate
+from sonar_graph.models import BIASES, bias_sigmas, by_biases, elevation_on_floor, locate
 from sonar_graph.navigation import Odometry, PreintegratedMotion
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission

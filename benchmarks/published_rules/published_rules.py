@@ -27,8 +27,7 @@ from sonar_graph import Calibration, Odometry
 from sonar_graph.calibration import Section
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Depth, Dvl, Floats, Imu, LandmarkDetections, Measurements
-from sonar_graph.models.identity import ACCEPTED, MINIMUM_PROBABILITY, identify
-from sonar_graph.models.sonar import elevation_on_floor, locate
+from sonar_graph.models import ACCEPTED, MINIMUM_PROBABILITY, elevation_on_floor, identify, locate
 from sonar_graph.motion import MotionSource, PreintegratedMotion
 from sonar_graph.navigation import JointPreintegrator
 from sonar_graph.navigation.joint_preintegration import DopplerRule

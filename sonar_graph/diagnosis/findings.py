@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Start
 from sonar_graph.errors import AlignmentError
 from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Heading, Imu
-from sonar_graph.models.sonar import wrap_angle
+from sonar_graph.models import wrap_angle
 from sonar_graph.navigation.alignment import (
     LONGEST_S,
     DvlMatch,

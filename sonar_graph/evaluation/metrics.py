@@ -15,7 +15,7 @@ import numpy as np
 
 from sonar_graph.errors import EvaluationError
 from sonar_graph.measurements import NS_PER_S, Floats, Ints
-from sonar_graph.models.sonar import wrap_angle
+from sonar_graph.models import wrap_angle
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import FIRST_ANONYMOUS_ID, LandmarkMap, Trajectory
 

@@ -4,7 +4,7 @@
 from sonar_graph.slam.isam2 import Isam2, Isam2Params
 from sonar_graph.slam.keyframes import KeyframeParams
 from sonar_graph.slam.landmarks import AssociatedUnknown, GatedIdentity, MixtureIdentity, RobustIdentity
-from sonar_graph.models.kernels import GaussianKernel, RobustKernel
+from sonar_graph.models import (GaussianKernel, RobustKernel)
 from sonar_graph.slam.smoother import BoundedHistory, SmootherParams, WholeHistory
 
 __all__ = [

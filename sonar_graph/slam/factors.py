@@ -25,10 +25,7 @@ import numpy as np
 from sonar_graph.calibration import Calibration, PlanarMotion
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Floats
-from sonar_graph.models.aiding import HUBER_WIDTHS, yaw_and_derivative
-from sonar_graph.models.biases import ACCEL, BIASES, COMPASS
-from sonar_graph.models.kernels import Robust
-from sonar_graph.models.sonar import wrap_angle
+from sonar_graph.models import ACCEL, BIASES, COMPASS, HUBER_WIDTHS, Robust, wrap_angle, yaw_and_derivative
 from sonar_graph.navigation import PreintegratedMotion
 from sonar_graph.numerics import cross_matrix
 from sonar_graph.slam.sighting_factor import CorrelatedSighting

@@ -21,9 +21,18 @@ from pydantic import Field
 
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.measurements import Depth, Dvl, Floats, Heading, Imu, Ints
-from sonar_graph.models.aiding import HUBER_WIDTHS, Contradictions
-from sonar_graph.models.biases import BIASES, COMPASS, HEADING, TILT, bias_sigmas, by_biases, gyro_bias_of
-from sonar_graph.models.sonar import wrap_angle
+from sonar_graph.models import (
+    BIASES,
+    COMPASS,
+    HEADING,
+    HUBER_WIDTHS,
+    TILT,
+    Contradictions,
+    bias_sigmas,
+    by_biases,
+    gyro_bias_of,
+    wrap_angle,
+)
 from sonar_graph.motion import MotionSource, PreintegratedMotion
 from sonar_graph.navigation.alignment import gravity_direction
 from sonar_graph.numerics import cross_matrix

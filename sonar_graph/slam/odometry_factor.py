@@ -21,7 +21,7 @@ import gtsam
 import numpy as np
 
 from sonar_graph.measurements import Floats
-from sonar_graph.models.biases import HEADING
+from sonar_graph.models import HEADING
 from sonar_graph.motion import PreintegratedMotion
 from sonar_graph.slam.factors import ORIGIN, gaussian
 from sonar_graph.slam.odometry_arrays import odometry_derivatives, odometry_errors, pose_row, poses_of

@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 
 from sonar_graph.measurements import Floats
-from sonar_graph.models.sonar import view_points, wrap_angle
+from sonar_graph.models import view_points, wrap_angle
 from sonar_graph.navigation import PreintegratedMotion
 from sonar_graph.slam.smoother import JointCovariance
 

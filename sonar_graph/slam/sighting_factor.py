@@ -14,7 +14,7 @@ import gtsam
 import numpy as np
 
 from sonar_graph.measurements import Floats
-from sonar_graph.models.sonar import project_points, view_points, wrap_angle
+from sonar_graph.models import project_points, view_points, wrap_angle
 from sonar_graph.slam.odometry_arrays import poses_of
 
 UNIT = gtsam.noiseModel.Unit.Create(2)

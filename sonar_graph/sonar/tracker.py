@@ -32,7 +32,7 @@ from scipy.special import ndtr
 from sonar_graph.calibration import Section
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Floats, Ints
-from sonar_graph.models.sonar import project_points, wrap_angle
+from sonar_graph.models import project_points, wrap_angle
 from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.sonar.geometry import point_covariances, points
 from sonar_graph.sonar.regions import Candidates

@@ -22,9 +22,7 @@ from baselines.sonar_update import (
 )
 from sonar_graph.calibration import FloorPrior, SonarCalibration
 from sonar_graph.measurements import NS_PER_S
-from sonar_graph.models.identity import gate_threshold
-from sonar_graph.models.kernels import RobustKernel
-from sonar_graph.models.sonar import FLOOR_GATE, elevation_on_floor, locate, range_azimuth
+from sonar_graph.models import FLOOR_GATE, RobustKernel, elevation_on_floor, gate_threshold, locate, range_azimuth
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission

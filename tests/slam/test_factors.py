@@ -16,9 +16,7 @@ from scipy.stats import chi
 from sonar_graph.calibration import Calibration, PlanarMotion, Start
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Dvl, Imu
-from sonar_graph.models.aiding import HUBER_WIDTHS
-from sonar_graph.models.kernels import RobustKernel
-from sonar_graph.models.sonar import range_azimuth
+from sonar_graph.models import HUBER_WIDTHS, RobustKernel, range_azimuth
 from sonar_graph.navigation.joint_preintegration import JointMotion, JointPreintegrator
 from sonar_graph.slam import factors
 from sonar_graph.slam.inertial_factors import doppler_odometry, inertial_doppler_odometry

@@ -10,7 +10,7 @@ from scipy.integrate import trapezoid
 from scipy.stats import multivariate_normal
 
 from sonar_graph.measurements import Floats
-from sonar_graph.models.kernels import Kernel
+from sonar_graph.models import Kernel
 from sonar_graph.slam import GaussianKernel, RobustKernel, factors
 from sonar_graph.slam.landmarks import mixture
 from sonar_graph.slam.landmarks.mixture import (

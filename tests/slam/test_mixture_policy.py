@@ -12,7 +12,7 @@ from scipy.stats import multivariate_normal
 from sonar_graph import run_estimator
 from sonar_graph.calibration import FloorPrior, SonarCalibration
 from sonar_graph.measurements import Floats
-from sonar_graph.models.kernels import Kernel
+from sonar_graph.models import Kernel
 from sonar_graph.slam import GaussianKernel, KeyframeParams, MixtureIdentity, RobustIdentity, RobustKernel
 from sonar_graph.slam.landmarks import mixture
 from sonar_graph.slam.landmarks import mixture_policy as doubtful_identities

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from sonar_graph.measurements import Floats
-from sonar_graph.models.sonar import (
+from sonar_graph.models import (
     elevation_on_floor,
     locate,
     locate_jacobians,

@@ -36,8 +36,7 @@ from pydantic import Field
 
 from sonar_graph.calibration import Section
 from sonar_graph.measurements import Floats, LandmarkDetections
-from sonar_graph.models.kernels import Kernel
-from sonar_graph.models.sonar import project_points, wrap_angle
+from sonar_graph.models import Kernel, project_points, wrap_angle
 from sonar_graph.slam.landmarks.sighting import Sighting
 
 REPEATED_LOSS = 3.0

@@ -21,7 +21,7 @@ from gtsam.symbol_shorthand import L
 from pydantic import Field
 
 from sonar_graph.measurements import NO_TRACK, LandmarkDetections
-from sonar_graph.models.kernels import Kernel
+from sonar_graph.models import Kernel
 from sonar_graph.slam.estimates import Solution
 from sonar_graph.slam.landmarks.landmark_graph import Assignment, LandmarkGraph
 from sonar_graph.slam.landmarks.mixture import (

@@ -13,9 +13,9 @@ import numpy as np
 
 from sonar_graph.calibration import FloorPrior, SonarCalibration
 from sonar_graph.measurements import Floats, LandmarkDetections
-from sonar_graph.models.kernels import Robust
-from sonar_graph.models.sonar import (
+from sonar_graph.models import (
     FLOOR_GATE,
+    Robust,
     elevation_on_floor,
     locate,
     locate_jacobians,

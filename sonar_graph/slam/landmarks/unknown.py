@@ -30,8 +30,7 @@ from pydantic import Field
 from sonar_graph.calibration import Section
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats, LandmarkDetections
-from sonar_graph.models.identity import gate_threshold
-from sonar_graph.models.sonar import wrap_angle
+from sonar_graph.models import gate_threshold, wrap_angle
 from sonar_graph.slam.keyframes import Keyframes
 from sonar_graph.slam.landmarks.joint_compatibility import UNPAIRED, Innovations, believed, log_density, pair_jointly
 from sonar_graph.slam.landmarks.landmark_graph import Assignment, LandmarkGraph

@@ -22,8 +22,7 @@ import gtsam
 import numpy as np
 
 from sonar_graph.measurements import Floats
-from sonar_graph.models.biases import BIASES
-from sonar_graph.models.sonar import project, wrap_angle
+from sonar_graph.models import BIASES, project, wrap_angle
 
 MAX_STEPS = 50
 """Steps that a descent may try, whether or not they lower the error: each costs a factorisation of the graph."""
