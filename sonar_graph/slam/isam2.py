@@ -126,7 +126,7 @@ class Isam2:
         p: Isam2Params = params or Isam2Params()
         self._params = p
         self._asked = PoseHistory()
-        self._smoother = Smoother(p.smoother, self._asked if p.history.policy == "bounded" else None)
+        self._smoother = Smoother(p.smoother, p.history, self._asked)
         self._keyframes = Keyframes(calibration, odometry, p.keyframes, self._smoother)
         self._sightings = Frontend(p.identity, p.kernel, self._keyframes)
 
@@ -141,7 +141,7 @@ class Isam2:
 
         Of a bounded history those in the window.
         """
-        return self._smoother.values
+        return self._smoother.values.all()
 
     @property
     def keyframe_count(self) -> int:

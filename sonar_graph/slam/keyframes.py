@@ -108,7 +108,7 @@ class Keyframes:
         self._latest: tuple[int, PreintegratedMotion] | None = None
         self._linearised: tuple[Floats, Floats] = np.zeros(BIASES), np.eye(3)
         self._waiting: dict[str, list[Any]] = {"depth": [], "heading": []}
-        self._lag_ns = min(round(min(self.smoother.params.lag_s, 1e9) / S_PER_NS), LONGEST_LATE_NS)
+        self._lag_ns = min(round(self.smoother.lag_s / S_PER_NS), LONGEST_LATE_NS)
         self._newest_heading_ns, self._reached_ns = EARLIEST_NS, LATEST_NS
         self._told = 0
         self._refused: list[RefusedRow] = []

@@ -147,7 +147,7 @@ class NamelessLandmarks:
     def __init__(self, landmarks: LandmarkGraph, keyframes: Keyframes, params: AssociatedUnknown) -> None:
         self._landmarks, self._keyframes, self._params = landmarks, keyframes, params
         self._smoother, self._factors = landmarks.smoother, landmarks.factors
-        self._longest_wait_s = max(min(params.longest_wait_s, self._smoother.params.lag_s - ROUNDING_S), 0.0)
+        self._longest_wait_s = max(min(params.longest_wait_s, self._smoother.lag_s - ROUNDING_S), 0.0)
         self._candidates: list[Candidate] = []
         self._next_id = FIRST_ANONYMOUS_ID
 

@@ -1,19 +1,23 @@
-"""Solvers of the graph.
+"""Solvers of the graph: incremental in a window, whole on request, without factors that leave variables undetermined.
 
-Incremental in a window (`incremental`), whole at the end (`batch_solution`), and without factors that leave variables
-undetermined (`observability`).
+smoother.py        the growing graph: updates, exchanges of factors, restarts
+window.py          GTSAM's iSAM2, and its fixed-lag smoother for a bounded history
+batch_solution.py  Levenberg-Marquardt over the whole graph
+covariance.py      marginal and joint covariances
+factor_store.py    groups of factors by handle
+observability.py   factors that leave directions open, and messages about them
+variables.py       kinds, dimensions and names of variables
 """
 
 # fmt: off
-from sonar_graph.slam.smoother.batch_solution import (
-    JointCovariance, Marginals, Sightline, solve, solve_in_sight,
-)
+from sonar_graph.slam.smoother.batch_solution import Sightline, solve, solve_in_sight
+from sonar_graph.slam.smoother.covariance import JointCovariance, Marginals
 from sonar_graph.slam.smoother.factor_store import FactorGroup, Factors
-from sonar_graph.slam.smoother.incremental import (
-    BoundedHistory, Changed, HistoryParams, Smoother, SmootherParams, WholeHistory,
+from sonar_graph.slam.smoother.smoother import (
+    BoundedHistory, Changed, Estimates, HistoryParams, Smoother, SmootherParams, WholeHistory,
 )
 
 __all__ = [
-    "BoundedHistory", "Changed", "FactorGroup", "Factors", "HistoryParams", "JointCovariance", "Marginals", "Sightline",
-    "Smoother", "SmootherParams", "WholeHistory", "solve", "solve_in_sight",
+    "BoundedHistory", "Changed", "Estimates", "FactorGroup", "Factors", "HistoryParams", "JointCovariance",
+    "Marginals", "Sightline", "Smoother", "SmootherParams", "WholeHistory", "solve", "solve_in_sight",
 ]

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import gtsam
 
 from sonar_graph.slam.smoother.batch_solution import Sightline, Sightlines
+from sonar_graph.slam.smoother.variables import is_landmark, is_pose
 
-POSE, LANDMARK = ord("x"), ord("l")
 Factors = dict[str, gtsam.NonlinearFactor]
 """Factors by their labels in messages, such as "range"."""
 
@@ -33,31 +33,29 @@ class FactorStore:
     """Groups of factors in the order in which they came, each with a handle that stays the same."""
 
     def __init__(self) -> None:
-        self.size = 0
-        """Number of factors."""
         self.new: dict[int, FactorGroup] = {}
         """Groups that the window has not taken up yet, by handle."""
         self.new_graph = gtsam.NonlinearFactorGraph()
         """Their factors."""
         self.gone: set[gtsam.NonlinearFactor] = set()
         """Factors that were taken out since the window took up the others."""
-        self._groups: dict[int, FactorGroup] = {}
+        self.groups: dict[int, FactorGroup] = {}
+        """All groups by handle."""
         self._leaving_with: dict[int, list[int]] = defaultdict(list)
         self._next = 0
 
     def add(self, group: FactorGroup) -> int:
         """Handle of a new group."""
         handle, self._next = self._next, self._next + 1
-        self._groups[handle] = self.new[handle] = group
-        self.size += len(group.factors)
+        self.groups[handle] = self.new[handle] = group
         for factor in group:
             self.new_graph.add(factor)
         if group.seen is not None:
             lasting = [group.seen[1].pose_key]
         else:
             keys = {key for factor in group for key in list(factor.keys())}
-            poses = [key for key in keys if gtsam.symbolChr(key) == POSE]
-            lasting = poses or [key for key in keys if gtsam.symbolChr(key) != LANDMARK]
+            poses = [key for key in keys if is_pose(key)]
+            lasting = poses or [key for key in keys if not is_landmark(key)]
         if lasting:
             self._leaving_with[min(lasting)].append(handle)
         return handle
@@ -66,17 +64,19 @@ class FactorStore:
         """Take groups out."""
         for handle in handles:
             self.new.pop(handle, None)
-            group = self._groups.pop(handle)
+            group = self.groups.pop(handle)
             self.gone.update(group)
-            self.size -= len(group.factors)
         self.new_graph = graph_of(self.new.values())
 
-    def leave(self, keys: Iterable[int]) -> None:
-        """Give up the groups that leave with these variables."""
+    def leave(self, keys: Iterable[int]) -> list[int]:
+        """Drop the groups that leave with these variables; their handles."""
+        left = []
         for key in keys:
             for handle in self._leaving_with.pop(key, ()):
-                if group := self._groups.pop(handle, None):
-                    self.size -= len(group.factors)
+                group = self.groups.pop(handle, None)
+                if group is not None:
+                    left.append(handle)
+        return left
 
     def take_up(self) -> None:
         """The window has taken up what was new, and let go of what is gone."""
@@ -84,14 +84,14 @@ class FactorStore:
 
     def factors(self, handles: Iterable[int]) -> list[gtsam.NonlinearFactor]:
         """Factors of some groups."""
-        return [factor for handle in handles for factor in self._groups[handle]]
+        return [factor for handle in handles for factor in self.groups[handle]]
 
     def graph(self, left_out: Container[int] = ()) -> gtsam.NonlinearFactorGraph:
         """All factors but those of some handles."""
-        return graph_of(group for handle, group in self._groups.items() if handle not in left_out)
+        return graph_of(group for handle, group in self.groups.items() if handle not in left_out)
 
     def __iter__(self) -> Iterator[FactorGroup]:
-        return iter(self._groups.values())
+        return iter(self.groups.values())
 
     def sightlines(self) -> Sightlines:
         """All sightings, by landmark's key."""

@@ -17,9 +17,8 @@ import numpy as np
 
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats
-from sonar_graph.slam.smoother.batch_solution import tangent_size
 from sonar_graph.slam.smoother.factor_store import FactorStore
-from sonar_graph.slam.smoother.submaps import BLAS
+from sonar_graph.slam.smoother.variables import tangent_size, variable_name
 
 Labelled = tuple[str, gtsam.NonlinearFactor]
 MARGINAL = "marginal of what left the window"
@@ -80,8 +79,7 @@ def left_open(
         return []
     lengths = np.linalg.norm(A, axis=0)
     scale = 1.0 / np.where(lengths > 0, lengths, 1.0)
-    with BLAS.limit(limits=1, user_api="blas"):
-        _, s, V = np.linalg.svd(np.linalg.qr(A * scale, mode="r"), full_matrices=True)
+    _, s, V = np.linalg.svd(np.linalg.qr(A * scale, mode="r"), full_matrices=True)
     rank = int(np.sum(s > RANK_LIMIT * max(s[0], 1e-300)))
     null = V[rank:] * scale
     null /= np.maximum(np.linalg.norm(null, axis=1, keepdims=True), 1e-300)
@@ -108,12 +106,6 @@ def _rows(factor: gtsam.NonlinearFactor, values: gtsam.Values, places: dict[int,
 def is_finite(factor: gtsam.NonlinearFactor, values: gtsam.Values) -> bool:
     """True when error and derivative of a factor are numbers."""
     return all(np.isfinite(part).all() for part in factor.linearize(values).jacobian())
-
-
-def variable_name(key: int) -> str:
-    """Kind and number of a variable, in words."""
-    kind = {"x": "keyframe", "l": "landmark", "b": "gyro bias"}.get(chr(gtsam.symbolChr(key)), "variable")
-    return f"{kind} {gtsam.Symbol(key).index()}"
 
 
 @dataclass(frozen=True, eq=False)
