@@ -26,7 +26,7 @@ EVERY_NODE = KeyframeParams(max_interval_s=0.1)
 SMOOTHERS = {
     name: Isam2Params(
         kernel=GaussianKernel(),
-        smoother=SmootherParams(lag_s=lag_s, relinearize_threshold=1e-6, submap_keyframes=3, waiting_gain=0.0),
+        smoother=SmootherParams(lag_s=lag_s, relinearize_threshold=1e-6, waiting_gain=0.0),
         keyframes=EVERY_NODE,
     )
     for name, lag_s in (("everything kept", 1e6), ("three seconds kept", 3.1))

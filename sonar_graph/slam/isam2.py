@@ -141,7 +141,7 @@ class Isam2:
 
         Of a bounded history those in the window.
         """
-        return self._smoother.values.all()
+        return self._smoother.values
 
     @property
     def keyframe_count(self) -> int:
@@ -179,7 +179,7 @@ class Isam2:
         newest = len(self._keyframes.stamps_ns) - 1
         instant = AnchoredPose(measurements.end_ns, newest, self._keyframes.bias_keys[newest], motion)
         self._asked.add(instant)
-        return instant.carried_on(self._smoother.values, self._smoother.joint_covariance(instant.keys()))
+        return instant.carried_on(self._smoother.estimates, self._smoother.joint_covariance(instant.keys()))
 
     def _fixes(self, positions: PositionFixes) -> list[tuple[int, partial[None]]]:
         """What to do with each sound position fix, with its stamp."""
@@ -324,7 +324,7 @@ class Isam2:
         """
         smoother = self._smoother
         ids = [i for i in smoother.landmark_ids if smoother.in_window([L(i)])]
-        return map_of(smoother.values, smoother.marginals, ids)
+        return map_of(smoother.estimates, smoother.marginals, ids)
 
     def detections(self) -> DetectionLog:
         """Outcome of each detection; of doubtful identities in the history of `trajectory`."""

@@ -108,7 +108,7 @@ class Keyframes:
         self._latest: tuple[int, PreintegratedMotion] | None = None
         self._linearised: tuple[Floats, Floats] = np.zeros(BIASES), np.eye(3)
         self._waiting: dict[str, list[Any]] = {"depth": [], "heading": []}
-        self._lag_ns = min(round(self.smoother.lag_s / S_PER_NS), LONGEST_LATE_NS)
+        self._lag_ns = min(round(self.smoother.params.lag_s / S_PER_NS), LONGEST_LATE_NS)
         self._newest_heading_ns, self._reached_ns = EARLIEST_NS, LATEST_NS
         self._told = 0
         self._refused: list[RefusedRow] = []
@@ -254,7 +254,7 @@ class Keyframes:
 
         At the first question they would depend on who asks.
         """
-        attitude = self.smoother.values.atPose3(self.newest_key).rotation().matrix()
+        attitude = self.smoother.estimates.atPose3(self.newest_key).rotation().matrix()
         self._linearised, self._latest = (self.bias(len(self.stamps_ns) - 1), attitude), None
 
     def update_if_due(self) -> Changed | None:
@@ -263,15 +263,15 @@ class Keyframes:
 
     def bias(self, index: int) -> Floats:
         """Newest estimate of the biases that hold from a keyframe on, shape (9,)."""
-        return np.asarray(self.smoother.values.atVector(self.bias_keys[index]))
+        return np.asarray(self.smoother.estimates.atVector(self.bias_keys[index]))
 
     def _set(self, node_ns: int, known_ns: int) -> None:
         """Set a keyframe at an epoch that is reached at an instant."""
         for sensor, distances in self._unjudged:
-            self.contradictions.judge(sensor, distances(self.smoother.values))
+            self.contradictions.judge(sensor, distances(self.smoother.estimates))
         self._unjudged.clear()
         i, j = len(self.stamps_ns) - 1, len(self.stamps_ns)
-        start_ns, bias, world_T_i = self.stamps_ns[-1], self.bias(i), self.smoother.values.atPose3(X(i))
+        start_ns, bias, world_T_i = self.stamps_ns[-1], self.bias(i), self.smoother.estimates.atPose3(X(i))
         attitude = world_T_i.rotation().matrix()
         motion = self._motion(start_ns, node_ns, bias, attitude, known_ns)
         self.smoother.add_pose(X(j), world_T_i.compose(motion.i_T_j), node_ns * S_PER_NS)
@@ -341,7 +341,7 @@ class Keyframes:
         """One factor for samples that are averaged; the port at sample k lies at ``k_T_j^-1 port`` in frame j."""
         if carried is None:
             return
-        ups = carried.k_R_j[1:] @ self.smoother.values.atPose3(X(j)).rotation().matrix()[2]
+        ups = carried.k_R_j[1:] @ self.smoother.estimates.atPose3(X(j)).rotation().matrix()[2]
         wander_m2 = np.einsum("ka,kab,kb->k", ups, carried.C[:, 3:, 3:], ups)
         variance_m2, z_m = depth.variance_m2[carried.first :], depth.z_m[carried.first :]
         variance_m2 = np.where(np.isnan(variance_m2), self.calibration.depth.sigma_m**2, variance_m2)
@@ -358,7 +358,7 @@ class Keyframes:
         """
         if carried is None:
             return
-        R_j = self.smoother.values.atPose3(X(j)).rotation().matrix()
+        R_j = self.smoother.estimates.atPose3(X(j)).rotation().matrix()
         R_k = R_j @ carried.k_R_j.transpose(0, 2, 1)
         yaw_rad = np.arctan2(R_k[:, 1, 0], R_k[:, 0, 0])
         ups = carried.k_R_j[1:] @ R_j[2]
@@ -388,7 +388,7 @@ class Keyframes:
         if i < 0 or self.stamps_ns[i] < self.stamps_ns[-1] - self._lag_ns or not self.smoother.in_window([X(i)]):
             self.refuse("positions", stamp_ns, Refusal.LATE)
             return
-        values, start_ns = self.smoother.values, self.stamps_ns[i]
+        values, start_ns = self.smoother.estimates, self.stamps_ns[i]
         R_i = values.atPose3(X(i)).rotation().matrix()
         if stamp_ns >= self.advanced_ns:
             motion = self._over_gap(stamp_ns, self.motion_since_newest(stamp_ns))
@@ -422,7 +422,7 @@ class Keyframes:
         old = self.bias_keys[i]
         new = B(gtsam.Symbol(old).index() + 1)
         self._bias_since_ns = node_ns
-        self.smoother.add_bias(new, self.smoother.values.atVector(old))
+        self.smoother.add_bias(new, self.smoother.estimates.atVector(old))
         walked = np.where(self._walks > 0, self._walks * np.sqrt(elapsed_s), factors.STEADY * self._bias_sigmas)
         self.smoother.add({"bias walk": factors.bias_walk(old, new, walked)})
         return new

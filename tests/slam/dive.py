@@ -10,7 +10,7 @@ from sonar_graph.slam import GatedIdentity, GaussianKernel, KeyframeParams, Mixt
 from sonar_graph.slam.frontend import Frontend
 from sonar_graph.slam.keyframes import Keyframes
 from sonar_graph.slam.landmarks.tracked import TrackedIdentity
-from sonar_graph.slam.smoother.incremental import Smoother
+from sonar_graph.slam.smoother import Smoother
 from sonar_graph.states import Outcome
 
 from .made import detected, polar, smoother_with

@@ -16,7 +16,7 @@ from sonar_graph.sequence import Sequence
 from sonar_graph.settings import nested
 from sonar_graph.slam import Isam2, Isam2Params
 from sonar_graph.slam.estimates import PoseHistory
-from sonar_graph.slam.smoother import Smoother, SmootherParams
+from sonar_graph.slam.smoother import BoundedHistory, Smoother, SmootherParams, WholeHistory
 from sonar_graph.states import Estimate
 
 POSES = {
@@ -49,18 +49,17 @@ def smoother_with(
     stale_shift_m: float = 1e9,
     waiting_gain: float = 0.0,
     *,
-    submap_keyframes: int = 1,
     is_bounded: bool = False,
 ) -> Smoother:
-    """One that keeps all poses, never restarts and lets nothing wait, unless told so; its submaps are small."""
+    """One that keeps all poses, never restarts and lets nothing wait, unless told so."""
     params = SmootherParams(
         lag_s=lag_s,
         relinearize_threshold=relinearize_threshold,
-        submap_keyframes=submap_keyframes,
+        relinearize_interval_s=0.0,
         stale_shift_m=stale_shift_m,
         waiting_gain=waiting_gain,
     )
-    return Smoother(params, PoseHistory() if is_bounded else None)
+    return Smoother(params, BoundedHistory() if is_bounded else WholeHistory(), PoseHistory())
 
 
 def values_of(**named: Any) -> gtsam.Values:

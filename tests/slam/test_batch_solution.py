@@ -6,9 +6,8 @@ import pytest
 from gtsam.symbol_shorthand import L, X
 
 from sonar_graph.slam import factors
-from sonar_graph.slam.smoother import Smoother, batch_solution
+from sonar_graph.slam.smoother import Marginals, Smoother, batch_solution
 from sonar_graph.slam.smoother.batch_solution import (
-    Marginals,
     Sightline,
     Sightlines,
     StackedGraph,

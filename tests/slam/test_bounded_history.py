@@ -78,13 +78,13 @@ def test_smoothed_poses_are_better_than_causal_ones_and_worse_than_those_of_the_
 def held(estimator: Isam2) -> dict[str, int]:
     """Sizes of all that could grow with the run."""
     smoother, sightings = estimator._smoother, estimator._sightings
-    window = smoother._window.isam
+    window = smoother._window
     return {
         "values": smoother.values.size(),
         "factors": smoother.graph.size(),
-        "slots": window.getFactors().size(),
-        "groups": len(smoother._store._groups) + sum(map(len, smoother._store._leaving_with.values())),
-        "expiring": len(smoother._expiring),
+        "slots": window.factors().size(),
+        "groups": len(smoother._store.groups) + sum(map(len, smoother._store._leaving_with.values())),
+        "expiring": len(smoother._times_s),
         "sightlines": sum(map(len, smoother._store.sightlines().values())),
         "sightings": sum(len(seen) for seen in sightings.landmarks._of.values()),
         "tracks": sum(len(t.waiting) + len(t.settled) for t in sightings.policy._tracks.values()),
@@ -161,7 +161,7 @@ def test_a_window_that_begins_anew_says_the_same():
             estimator._smoother._give_up_cholesky(estimator._keyframes.newest_s)
         assert estimate.world_T_body.equals(expected[k].world_T_body, 1e-7)
         assert np.allclose(estimate.covariance[3, 3], expected[k].covariance[3, 3], rtol=1e-5)
-    assert estimator._smoother._window.is_by_qr
+    assert estimator._smoother._is_by_qr
     assert np.allclose(estimator.trajectory().positions, plain.trajectory().positions, rtol=0, atol=1e-7)
 
 

@@ -13,7 +13,7 @@ from sonar_graph.measurements import Floats
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 from sonar_graph.slam import Isam2
 from sonar_graph.slam.estimates import AnchoredPose
-from sonar_graph.slam.smoother.batch_solution import JointCovariance
+from sonar_graph.slam.smoother import JointCovariance
 from sonar_graph.states import FIRST_ANONYMOUS_ID, Outcome
 from sonar_graph.testing.numerical import central_differences
 
@@ -56,7 +56,6 @@ def ran(lag_s: float, history: str = "whole", kernel: str = "none") -> Isam2:
     return run(
         simulate_mission(MissionOptions(duration_s=40.0, imu="mti1", landmarks=6)),
         smoother__lag_s=lag_s,
-        smoother__submap_keyframes=3,
         history__policy=history,
         kernel__shape=kernel,
         smoother__waiting_gain=0.0,
@@ -88,7 +87,7 @@ def test_over_the_window_it_is_the_same_where_variables_are_linearised_if_nothin
     found = estimator.joint_covariance(KEYFRAMES, (), LANDMARKS)
     linearised = estimator._smoother._window.linearised_at
     assert off_sigmas(found.matrix, dense(estimator, linearised, KEYS)) < 1e-6
-    assert 1e-4 < off_sigmas(found.matrix, dense(estimator, estimator.values, KEYS)) < 0.02
+    assert 1e-4 < off_sigmas(found.matrix, dense(estimator, estimator.values, KEYS)) < 0.05
 
 
 def test_of_a_bounded_history_it_is_the_inverse_of_the_windows_information():
@@ -119,7 +118,6 @@ REFUSED = [
     ({"landmark": -1}, r"landmark -1 is not in the graph"),
     ({"stamp_ns": 5}, r"no keyframe at 5 ns; the nearest are at \d+ ns"),
     ({"stamp_ns": "after the second"}, r"no keyframe at \d+ ns; the nearest are at \d+ and \d+ ns"),
-    ({"keyframe": 0}, r'keyframe 0 has left the window, which holds \d+ to \d+; ask over="history"'),
     ({}, r"marginal\(\) is of one variable; give one of keyframe, stamp_ns and landmark"),
     ({"keyframe": 1, "landmark": 2}, r"marginal\(\) is of one variable; give one of keyframe, stamp_ns and landmark"),
     ({"keyframe": 0, "over": "history"}, "keyframe 0 has left the window, .*; none is known any more"),

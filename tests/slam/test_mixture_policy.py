@@ -243,7 +243,7 @@ def test_all_of_the_window_is_chosen_anew_and_not_only_the_newest() -> None:
     assert world.outcomes == [Outcome.REASSIGNED] * 2 + [Outcome.NEW]
 
 
-def test_a_track_that_gets_another_name_is_chosen_anew_also_where_it_has_left_the_window(monkeypatch) -> None:
+def test_a_track_that_gets_another_name_is_associated_again(monkeypatch) -> None:
     """An equal one, of no track and as wrongly named, is not."""
     world = short_lived(monkeypatch)
     for k in (1, 2):
@@ -252,26 +252,9 @@ def test_a_track_that_gets_another_name_is_chosen_anew_also_where_it_has_left_th
         show(world, 0.3 * k, at(0.3 * k, 9), [9], [-1])
     first = world.sightings.policy.watches[0]
     assert first.landmark_id == 4
-    assert not world.smoother.in_window([first.sightings[0].line.pose_key])
     show(world, 3.6, at(3.6, 7), [7], [2])
     assert first.landmark_id == 7
     assert world.sightings.landmarks.ids == [7, 9]
-
-
-@pytest.mark.parametrize(("name", "is_waiting"), [(-1, True), (7, False)])
-def test_keyframes_of_what_waits_are_held_and_of_what_is_known_are_not(
-    name: int, is_waiting: bool, monkeypatch
-) -> None:
-    world = short_lived(monkeypatch)
-    show(world, 0.3, at(0.3, 7), [name], [2])
-    (first,) = world.sightings.policy.watches
-    for k in range(2, 12):
-        show(world, 0.3 * k, at(0.3 * k, 9), [9], [-1])
-    key = first.sightings[0].line.pose_key
-    assert (world.smoother.in_window([key]) == [key]) is is_waiting
-    show(world, 3.6, at(3.6, 7), [7], [2])
-    assert first.landmark_id == 7
-    assert len(first.sightings) == 2
 
 
 def test_what_waited_in_a_frame_that_shows_the_landmark_already_is_not_of_it(monkeypatch) -> None:

@@ -24,7 +24,7 @@ from sonar_graph.models import (
 )
 from sonar_graph.navigation import PreintegratedMotion
 from sonar_graph.slam.prediction import PredictedView, Source, weigh
-from sonar_graph.slam.smoother.batch_solution import JointCovariance
+from sonar_graph.slam.smoother import JointCovariance
 from sonar_graph.testing import check_derivative
 from sonar_graph.testing.numerical import central_differences
 

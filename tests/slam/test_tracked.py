@@ -19,8 +19,8 @@ from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 from sonar_graph.slam import Isam2, RobustKernel
 from sonar_graph.slam.landmarks.landmark_graph import IN_GRAPH
-from sonar_graph.slam.smoother import incremental as smoother_module
-from sonar_graph.slam.smoother.incremental import Smoother
+from sonar_graph.slam.smoother import Smoother
+from sonar_graph.slam.smoother import smoother as smoother_module
 from sonar_graph.states import Outcome
 from sonar_graph.testing import laws
 from sonar_graph.testing.laws import EstimatorRun, unlike

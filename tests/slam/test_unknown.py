@@ -24,8 +24,7 @@ from sonar_graph.slam.landmarks.unknown import (
     NamelessLandmarks,
     nearest_duplicates,
 )
-from sonar_graph.slam.smoother.batch_solution import JointCovariance, Sightline
-from sonar_graph.slam.smoother.incremental import Smoother
+from sonar_graph.slam.smoother import JointCovariance, Sightline, Smoother
 from sonar_graph.states import FIRST_ANONYMOUS_ID, Outcome
 
 from .graphs import assert_same_graph
@@ -34,7 +33,11 @@ from .made import plain, pose_prior, smoother_with
 
 TWO_LAPS = {"duration_s": 260.0, "laps": 2, "speed_m_s": 0.4, "seed": 3, "gyro_bias_scale": 0.0}
 CLEAN = {"tracks": True, "detection_probability": 1.0, "false_detections_per_frame": 0.0}
-ASSOCIATED = {"identity__unknown__policy": "associate", "identity__unknown__gate_probability": 1 - 1e-9}
+ASSOCIATED = {
+    "identity__unknown__policy": "associate",
+    "identity__unknown__gate_probability": 1 - 1e-9,
+    "smoother__relinearize_threshold": 1e-3,
+}
 USED = {Outcome.USED, Outcome.NEW, Outcome.PLACED_LATER, Outcome.USED_LATER, Outcome.MOVED}
 
 
@@ -59,7 +62,7 @@ def blind(sequence: Sequence | None = None) -> Sequence:
 def test_without_names_the_basin_is_that_with_names():
     """Four landmarks, every detection used for the right one, and the poses of a run that knew them."""
     sequence, true = clean(), clean().true_landmarks
-    known, estimator = run(sequence), run(blind(), **ASSOCIATED)
+    known, estimator = run(sequence, smoother__relinearize_threshold=1e-3), run(blind(), **ASSOCIATED)
     landmarks = estimator.landmarks()
     assert landmarks.ids.tolist() == [FIRST_ANONYMOUS_ID + k for k in range(4)]
     apart_m = np.linalg.norm(landmarks.positions[:, None, :2] - true.positions[None, :, :2], axis=-1)
@@ -73,7 +76,7 @@ def test_without_names_the_basin_is_that_with_names():
 def test_where_all_are_named_nothing_changes():
     """Bit for bit, with false detections too, of which a recogniser says that they are of no landmark it knows."""
     sequence = simulate_basin(BasinOptions(**TWO_LAPS, false_detections_per_frame=0.5))
-    one, other = run(sequence), run(sequence, **ASSOCIATED)
+    one, other = run(sequence, smoother__relinearize_threshold=1e-3), run(sequence, **ASSOCIATED)
     assert np.array_equal(one.trajectory().positions, other.trajectory().positions)
     assert one.detections().outcomes == other.detections().outcomes
 

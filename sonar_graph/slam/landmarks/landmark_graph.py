@@ -222,7 +222,7 @@ class LandmarkGraph:
         assert landmark_id is not None
         is_first = landmark_id not in self
         if is_first:
-            start = self.factors.place(sighting, self.smoother.values) if new.start is None else new.start
+            start = self.factors.place(sighting, self.smoother.estimates) if new.start is None else new.start
             self.smoother.add_landmark(L(landmark_id), start)
         made = self.factors.make(sighting, L(landmark_id), is_first=is_first)
         handle = self.smoother.add(made, (L(landmark_id), sighting.line), gain=new.gain)
@@ -254,7 +254,7 @@ class LandmarkGraph:
         ]
         removed += [sighting.handle for sighting in again]
         begun = {
-            L(landmark): self.factors.place(first, self.smoother.values)
+            L(landmark): self.factors.place(first, self.smoother.estimates)
             for landmark, first in firsts.items()
             if first is not None and before[landmark] is None
         }

@@ -115,7 +115,7 @@ class MixtureIdentities:
         ids = self._rivals(frame, statements)
         keys = [L(i) for i in ids]
         view = frame.predict(keys)
-        points = np.array([self._smoother.values.atPoint3(key) for key in keys]).reshape(-1, 3)
+        points = np.array([self._smoother.estimates.atPoint3(key) for key in keys]).reshape(-1, 3)
         expected, cov = view.expect(keys, points)
         scores: list[Scores] = []
         for row, said in enumerate(statements):
@@ -184,7 +184,7 @@ class MixtureIdentities:
         for landmark_id in sorted(self._disputed.intersection(self._landmarks.ids)):
             naming = [watch for watch in self.watches if watch.statement.favourite == landmark_id]
             present = [watch.landmark_id for watch in naming]
-            found = supporters_elsewhere(landmark_id, naming, present, self._smoother.values, self.mixture)
+            found = supporters_elsewhere(landmark_id, naming, present, self._smoother.estimates, self.mixture)
             if found is not None:
                 yield self._change([(w, None) for w in self.watches if w.landmark_id == landmark_id])
                 yield self._change([(w, landmark_id) for w in found])
@@ -205,7 +205,7 @@ class MixtureIdentities:
         return _assigned(_differing(chosen.watches, chosen.choices))
 
     def _changes(self, watches: list[TrackedObject]) -> Changes:
-        values, sizes = self._smoother.values, self._landmarks.sizes()
+        values, sizes = self._smoother.estimates, self._landmarks.sizes()
         return _differing(watches, self.mixture.best(watches, values, [w.landmark_id for w in watches], sizes))
 
     def _change(self, changes: Changes) -> list[Assignment]:
@@ -239,7 +239,7 @@ class MixtureIdentities:
             return ids
         world_T_sonar = frame.predict([]).world_T_sonar
         seen = np.array([beam_point(world_T_sonar, z)[:2] for z in frame.z])
-        points = np.array([self._smoother.values.atPoint3(L(i))[:2] for i in ids])
+        points = np.array([self._smoother.estimates.atPoint3(L(i))[:2] for i in ids])
         away_m = np.linalg.norm(points - seen[:, None], axis=2)
         near = np.argpartition(away_m, MOST_RIVALS - 1, axis=1)[:, :MOST_RIVALS]
         kept = {ids[k] for k in np.unique(near).tolist()}
@@ -257,7 +257,7 @@ class MixtureIdentities:
         While the estimate is uncertain, as when a loop closes, a large residual does not yet mean a wrong identity.
         With a robust kernel it may stay large for some updates.
         """
-        sighting, values = watch.sightings[-1], self._smoother.values
+        sighting, values = watch.sightings[-1], self._smoother.estimates
         ids = [i for i in (watch.landmark_id, new) if i is not None and i in self._landmarks]
         keys = [L(i) for i in ids]
         view = late_view(sighting, values, self._smoother.joint_covariance_of_any([sighting.line.pose_key, *keys]))

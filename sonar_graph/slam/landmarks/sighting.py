@@ -151,7 +151,9 @@ class SeenFrame:
         motion = keyframes.motion_since_newest(self.stamp_ns)
         pose_key, bias_key = keyframes.newest_key, keyframes.bias_keys[-1]
         joint = smoother.joint_covariance([pose_key, bias_key, *keys])
-        return PredictedView(pose_key, bias_key, smoother.values.atPose3(pose_key), motion, self._body_T_sonar, joint)
+        return PredictedView(
+            pose_key, bias_key, smoother.estimates.atPose3(pose_key), motion, self._body_T_sonar, joint
+        )
 
     def sightings(self, view: PredictedView, rows: list[int], points: Floats | None = None) -> list[Sighting]:
         """Sightings tied to the newest keyframe, which is set now if the motion since the last one blurs the frame.

@@ -269,11 +269,11 @@ class TrackedIdentities:
                 taken_ns.add(sighting.stamp_ns)
                 free.append(sighting)
         inside = set(free)
-        if np.isfinite(self._gate) and free and smoother.values.exists(key):
+        if np.isfinite(self._gate) and free and smoother.estimates.exists(key):
             joint = smoother.joint_covariance_of_any([key, *{sighting.line.pose_key for sighting in free}])
-            point = smoother.values.atPoint3(key)[None]
+            point = smoother.estimates.atPoint3(key)[None]
             for sighting in free:
-                view = late_view(sighting, smoother.values, joint)
+                view = late_view(sighting, smoother.estimates, joint)
                 if view.compare([key], point, sighting.line.z[None], sighting.noise[None]).distance[0] > self._gate:
                     inside.remove(sighting)
         judged = []
@@ -286,7 +286,7 @@ class TrackedIdentities:
 
     def _judge(self, frame: SeenFrame, rows: list[int]) -> list[Assignment]:
         """Use what has an identity, inside the gate if its landmark is in the graph; the rest waits in its track."""
-        values, make = self._landmarks.smoother.values, self._landmarks.factors
+        values, make = self._landmarks.smoother.estimates, self._landmarks.factors
         ids, refusals, is_tracked = frame.ids, frame.refusals, frame.detections.track != NO_TRACK
         named = [row for row in rows if refusals[row] is None]
         known = [row for row in named if ids[row] in self._landmarks]

@@ -147,7 +147,7 @@ class NamelessLandmarks:
     def __init__(self, landmarks: LandmarkGraph, keyframes: Keyframes, params: AssociatedUnknown) -> None:
         self._landmarks, self._keyframes, self._params = landmarks, keyframes, params
         self._smoother, self._factors = landmarks.smoother, landmarks.factors
-        self._longest_wait_s = max(min(params.longest_wait_s, self._smoother.lag_s - ROUNDING_S), 0.0)
+        self._longest_wait_s = max(min(params.longest_wait_s, self._smoother.params.lag_s - ROUNDING_S), 0.0)
         self._candidates: list[Candidate] = []
         self._next_id = FIRST_ANONYMOUS_ID
 
@@ -169,7 +169,7 @@ class NamelessLandmarks:
         yield self.forget()
         if len(self._landmarks.ids) > 1 and self._landmarks.ids[-1] >= FIRST_ANONYMOUS_ID:
             joint = self._smoother.joint_covariance([self._keyframes.newest_key, *self._keys()])
-            if found := nearest_duplicates(self._landmarks, self._smoother.values, joint, self._params):
+            if found := nearest_duplicates(self._landmarks, self._smoother.estimates, joint, self._params):
                 stays, goes = found
                 yield [Assignment(s, Outcome.MOVED, stays) for s in self._landmarks.sightings(goes)]
         if not rows:
@@ -203,7 +203,7 @@ class NamelessLandmarks:
         """True when a candidate has enough sightings, which place it well enough."""
         if len(candidate) < self._params.sightings:
             return False
-        _, cov = place(candidate, self._smoother.values, self._factors)
+        _, cov = place(candidate, self._smoother.estimates, self._factors)
         return bool(np.linalg.eigvalsh(cov)[-1] <= (LARGEST_SIGMA_SHARE * candidate[-1].line.z[0]) ** 2)
 
     def forget(self, left: Set[int] = frozenset()) -> list[Assignment]:
@@ -231,7 +231,7 @@ class NamelessLandmarks:
         taken
             Landmarks that are named in this frame.
         """
-        values = self._smoother.values
+        values = self._smoother.estimates
         ids = [i for i in self._landmarks.ids if i not in taken]
         keys = [L(i) for i in ids]
         points = np.array([values.atPoint3(key) for key in keys])

@@ -38,7 +38,6 @@ MOST_STEPS = 4
 """Further Gauss-Newton steps in an update, at most: each costs as much as an update."""
 MOST_SETTLING_STEPS = 10
 """The same after an exchange of factors, which may move the estimate far."""
-LONGEST_S = 1e9
 ROUNDING_S = 1e-6
 """Margin for rounded times: a variable exactly as old as the lag stays."""
 
@@ -53,10 +52,14 @@ class SmootherParams(Section):
     0.05
     """
 
+    lag_s: float = Field(15.0, gt=0)
+    """Age from which a bounded history marginalises poses. A whole history keeps all poses."""
     relinearize_threshold: float = Field(0.01, gt=0)
     """Change of a component of a variable (rad or m) above which the variable is relinearised."""
     relinearize_interval_s: float = Field(1.0, ge=0)
     """Least time between two relinearisations. 0: every update may relinearise."""
+    stale_shift_m: float = Field(0.1, gt=0)
+    """Move of a landmark from which a bounded history begins its window again at the batch solution of its graph."""
     waiting_gain: float = Field(5.0, ge=0)
     """New sightings and position fixes enter the estimate at the next keyframe, or as soon as their expected gain, the
     sum of predicted variance over noise variance, exceeds this. A fix counts fifty times. 0: always at once."""
@@ -93,12 +96,6 @@ class BoundedHistory(Section):
     """
 
     policy: Literal["bounded"] = "bounded"
-    lag_s: float = Field(15.0, gt=0)
-    """Age from which poses are marginalised."""
-    relinearize_threshold: float = Field(0.001, gt=0)
-    """As `SmootherParams.relinearize_threshold`, and smaller: a marginal keeps the linearisation point for good."""
-    stale_shift_m: float = Field(0.1, gt=0)
-    """Move of a landmark from its linearisation point from which the window begins again at the batch solution."""
     remembered_s: float | None = Field(None, gt=0)
     """Age from which `Isam2.trajectory` and `Isam2.detections` may drop entries; those older than 1.25 times this are
     dropped. None: all are kept."""
@@ -210,7 +207,7 @@ class Smoother:
     ) -> None:
         self.params = params
         self.history = history or WholeHistory()
-        self.values = Estimates()
+        self.estimates = Estimates()
         """The newest estimate of every variable in the window."""
         self.withheld: deque[str] = deque(maxlen=MOST_MESSAGES)
         """Messages about factors that were withheld, and why."""
@@ -235,10 +232,10 @@ class Smoother:
         self._taken_up = gtsam.NonlinearFactorGraph()
 
     def _empty_window(self) -> WholeWindow | FixedLagWindow:
+        threshold = self.params.relinearize_threshold
         if isinstance(self.history, BoundedHistory):
-            history = self.history
-            return FixedLagWindow(history.relinearize_threshold, history.lag_s, is_by_qr=self._is_by_qr)
-        return WholeWindow(self.params.relinearize_threshold, is_by_qr=self._is_by_qr)
+            return FixedLagWindow(threshold, self.params.lag_s, is_by_qr=self._is_by_qr)
+        return WholeWindow(threshold, is_by_qr=self._is_by_qr)
 
     # ---------------------------------------------------------------- what the graph is made of
 
@@ -260,9 +257,9 @@ class Smoother:
         return graph
 
     @property
-    def lag_s(self) -> float:
-        """Age from which poses leave the window; very large with a whole history."""
-        return self.history.lag_s if isinstance(self.history, BoundedHistory) else LONGEST_S
+    def values(self) -> gtsam.Values:
+        """The newest estimate of all variables in the window; a copy."""
+        return self.estimates.all()
 
     def graph_without(self, handles: set[int]) -> gtsam.NonlinearFactorGraph:
         """Every factor of a run with a whole history but those of some handles."""
@@ -275,7 +272,7 @@ class Smoother:
 
     def in_window(self, keys: list[int]) -> list[int]:
         """Keys of variables that are in the window, or about to be."""
-        return [key for key in keys if self.values.exists(key)]
+        return [key for key in keys if self.estimates.exists(key)]
 
     def add_pose(self, key: int, pose: gtsam.Pose3, time_s: float) -> None:
         """Add a keyframe with its first estimate; an `EstimatorError` where the key is taken or time runs back."""
@@ -300,9 +297,9 @@ class Smoother:
         self._newest_bias = key
 
     def _insert(self, key: int, first: gtsam.Pose3 | Floats) -> None:
-        if self.values.exists(key):
+        if self.estimates.exists(key):
             raise EstimatorError(f"isam2: {variable_name(key)} is in the graph already; give each its own key")
-        self.values.new.insert(key, first)
+        self.estimates.new.insert(key, first)
 
     def add(self, factors: Factors, seen: tuple[int, Sightline] | None = None, *, gain: float = 0.0) -> int:
         """Add factors that are used together or not at all (`FactorGroup`), at the next update; returns their handle.
@@ -322,7 +319,7 @@ class Smoother:
     @property
     def is_due(self) -> bool:
         """True when variables wait for an update, or factors that would change the estimate."""
-        return self.values.new.size() > 0 or self._waiting_gain > self.params.waiting_gain
+        return self.estimates.new.size() > 0 or self._waiting_gain > self.params.waiting_gain
 
     def update(self, time_s: float) -> Changed:
         """Update the window with all that was added; variables older than the lag leave a bounded one."""
@@ -385,7 +382,7 @@ class Smoother:
             return np.inf
         held = [key for key, until_s in self._held.items() if time_s <= until_s]
         ages_s = [time_s - self._times_s[key] + ROUNDING_S for key in held]
-        return max([self.history.lag_s, *ages_s])
+        return max([self.params.lag_s, *ages_s])
 
     def _lag_that_keeps_all(self, time_s: float) -> float:
         """Age (s) at which no variable leaves the window, for example while factors are being exchanged."""
@@ -404,9 +401,9 @@ class Smoother:
         if not is_solved:
             return
         self._iterate(time_s, MOST_STEPS, LEAST_ITERATED)
-        if isinstance(self.history, BoundedHistory) and isinstance(self._window, FixedLagWindow):
-            may_restart = time_s >= self._restarted_s + self.history.lag_s
-            if may_restart and self._window.largest_shift(self._landmarks) > self.history.stale_shift_m:
+        if isinstance(self._window, FixedLagWindow):
+            may_restart = time_s >= self._restarted_s + self.params.lag_s
+            if may_restart and self._window.largest_shift(self._landmarks) > self.params.stale_shift_m:
                 self._restart(time_s)
 
     def _iterate(self, time_s: float, most_steps: int, least: float) -> None:
@@ -428,11 +425,11 @@ class Smoother:
         store = self._store
         try:
             if isinstance(window, WholeWindow):
-                window.update(store.new, self.values.new, removed=self._removed, relinearises=relinearises)
+                window.update(store.new, self.estimates.new, removed=self._removed, relinearises=relinearises)
             else:
                 self._take_leave(time_s - lag_s)
                 times_s = self._used_at(time_s)
-                window.update(store.new, self.values.new, times_s, lag_s, removed=self._removed)
+                window.update(store.new, self.estimates.new, times_s, lag_s, removed=self._removed)
         except RuntimeError:
             if not self._go_without(time_s):
                 self._give_up_cholesky(time_s)
@@ -445,7 +442,7 @@ class Smoother:
         self._store.take_up()
         self._removed = []
         self._waiting_gain = 0.0
-        self.values.renew(self._window)
+        self.estimates.renew(self._window)
         self._kept_covariance.renew(self._landmarks)
         if isinstance(self._window, FixedLagWindow):
             self._leave(self._window)
@@ -463,7 +460,7 @@ class Smoother:
         """True when the estimate has a larger error than the linearisation point, from which the step started."""
         graph = self.graph
         error_before = graph.error(self._window.linearised_at)
-        error_after = graph.error(self.values.all())
+        error_after = graph.error(self.estimates.all())
         return not error_after <= error_before
 
     def _restart(self, time_s: float) -> None:
@@ -505,10 +502,10 @@ class Smoother:
 
     def _take_leave(self, oldest_s: float) -> None:
         """Let `Departures` take note of the variables that the next update marginalises."""
-        leaving = {key for key, t in self._times_s.items() if t < oldest_s and not self.values.new.exists(key)}
+        leaving = {key for key, t in self._times_s.items() if t < oldest_s and not self.estimates.new.exists(key)}
         leaving.discard(self._newest_bias)
         if leaving and self._departures is not None:
-            self._departures.leave(leaving, self.values, self.marginals)
+            self._departures.leave(leaving, self.estimates, self.marginals)
 
     def _leave(self, window: FixedLagWindow) -> None:
         """Forget variables that left a bounded window, and the groups of factors that left with them."""
@@ -523,13 +520,13 @@ class Smoother:
     # ---------------------------------------------------------------- factors that cannot be used
 
     def _blame(self) -> Blame:
-        return Blame(self._store, list(self.values.new.keys()), self._times_s)
+        return Blame(self._store, list(self.estimates.new.keys()), self._times_s)
 
     def _withhold_unusable(self) -> bool:
         """Withhold new factors with which the window could not be solved; True if there were any."""
         blame = self._blame()
         keys = blame.graph.keyVector()
-        values = picked(self.values, keys)
+        values = picked(self.estimates, keys)
         spoilt = blame.spoilt(values)
         if spoilt:
             self._withhold(spoilt)
@@ -545,14 +542,14 @@ class Smoother:
             self._refused |= handles
             self._store.remove(handles)
             for key in withheld.keys:
-                self.values.forget(key)
+                self.estimates.forget(key)
                 if key in self._landmarks:
                     self._landmarks.remove(key)
 
     def _forget(self, landmark_keys: Iterable[int]) -> None:
         for key in landmark_keys:
             self._landmarks.remove(key)
-            self.values.forget(key)
+            self.estimates.forget(key)
 
     def _go_without(self, time_s: float) -> bool:
         """Solve the window without the new factors that made its update fail; True if there were any."""
@@ -578,7 +575,7 @@ class Smoother:
     def _before_update(self) -> gtsam.Values:
         """Values before a failed or diverged update: the linearisation point, near the last good estimate."""
         values = gtsam.Values(self._window.linearised_at)
-        values.insert_or_assign(self.values.new)
+        values.insert_or_assign(self.estimates.new)
         return values
 
     # ---------------------------------------------------------------- covariances and the batch solution
@@ -605,6 +602,6 @@ class Smoother:
         """
         if self._solved is None:
             graph = self.graph
-            values = solve_in_sight(graph, self.values.all(), self._store.sightlines())
+            values = solve_in_sight(graph, self.estimates.all(), self._store.sightlines())
             self._solved = values, Marginals(graph, values)
         return self._solved
