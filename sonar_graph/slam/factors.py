@@ -253,6 +253,50 @@ def position(
     return gtsam.GPSFactorArm(pose_key, position_m, keyframe_p_antenna, robust(gaussian(cov_m2)))
 
 
+def position_with_biases(
+    keys: tuple[int, int],
+    position_m: Floats,
+    motion: PreintegratedMotion,
+    body_p_antenna: Floats,
+    cov_m2: Floats,
+    robust: Robust = huber,
+) -> gtsam.NoiseModelFactor:
+    """World position of a point of the body, a motion after a keyframe: ``p_i + R_i M(b) a - z``.
+
+    ``M(b) = M Exp(D (b - b_0))`` is the motion from the keyframe to the fix. Over a gap of the Doppler log its error
+    comes mostly from the biases b, so that the fix constrains keyframe and biases together.
+
+    Parameters
+    ----------
+    keys
+        Keyframe and biases.
+    position_m
+        z, shape (3,).
+    motion
+        M with D and b_0.
+    body_p_antenna
+        a, shape (3,), m.
+    cov_m2
+        Covariance of the fix and of the noise of the motion, without the biases' part, shape (3, 3).
+    """
+    pose_key, bias_key = keys
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:
+        world_T_i = values.atPose3(pose_key)
+        change = motion.D_bias @ (values.atVector(bias_key) - motion.bias)  # (6,)
+        i_T_j = motion.i_T_j.compose(gtsam.Pose3.Expmap(change))
+        arm = i_T_j.transformFrom(body_p_antenna)
+        if jacobians is not None:
+            R_i = world_T_i.rotation().matrix()
+            R_j = R_i @ i_T_j.rotation().matrix()
+            jacobians[0] = R_i @ np.hstack((-cross_matrix(arm), np.eye(3)))
+            by_motion = R_j @ np.hstack((-cross_matrix(body_p_antenna), np.eye(3)))
+            jacobians[1] = by_motion @ gtsam.Pose3.ExpmapDerivative(change) @ motion.D_bias
+        return np.asarray(world_T_i.transformFrom(arm)) - position_m
+
+    return gtsam.CustomFactor(robust(gaussian(cov_m2)), [pose_key, bias_key], error)
+
+
 def planar(pose_key: int, motion: PlanarMotion) -> dict[str, gtsam.NonlinearFactor]:
     """The keyframe is level and at the plane's height; factors by their labels in messages."""
     return {

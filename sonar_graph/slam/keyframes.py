@@ -399,6 +399,8 @@ class Keyframes:
         cov_m2 = cov_m2 + by_motion @ motion.covariance @ by_motion.T
         arm, gain = motion.i_T_j.transformFrom(antenna), np.inf
         factor = factors.position(X(i), position_m, arm, cov_m2)
+        if self._bends:
+            factor = factors.position_with_biases((X(i), self.bias_keys[i]), position_m, motion, antenna, cov_m2)
         if i == len(self.stamps_ns) - 1 and not self.smoother.is_due:
             by_pose = R_i @ np.hstack((-cross_matrix(arm), np.eye(3)))
             predicted = by_pose @ self.smoother.joint_covariance([X(i)]).at(X(i), X(i)) @ by_pose.T
