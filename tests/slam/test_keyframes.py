@@ -26,7 +26,7 @@ from sonar_graph.navigation.alignment.gravity import earth_rate_in_world
 from sonar_graph.numerics import cross_matrix
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 from sonar_graph.slam import Isam2
-from sonar_graph.slam.keyframes import KeyframeParams, Keyframes, weights_at_end
+from sonar_graph.slam.keyframes import KeyframeParams, Keyframes, average_at_end
 from tests.navigation.rows import NS, T0_NS, dvl, imu, stamps
 
 from .graphs import factors_of
@@ -247,7 +247,7 @@ def test_depths_of_a_turning_vehicle_are_carried_by_its_motion():
             start.compose(gtsam.Pose3.Expmap(twist * (when[k] + u * dt))).rotation().matrix()[2] for u in (0.25, 0.75)
         ]
         q.append(np.mean([up**2 @ sigmas**2 for up in ups]) * 0.2 * dt)
-    weights, variance = weights_at_end(np.full(len(when), 0.05**2), np.array(q))
+    weights, variance = average_at_end(np.full(len(when), 0.05**2), np.array(q))
     mean_port = weights @ [path[-1].transformTo(pose.transformFrom(np.array(port))) for pose in path[:-1]]
     values = gtsam.Values()
     for pose in (
@@ -462,7 +462,7 @@ def test_weights_are_those_of_least_squares_with_a_shared_random_walk(depths):
     C = np.minimum.outer(carried, carried) + np.diag(variance)
     ones = np.ones(len(variance))
     expected = np.linalg.solve(C, ones) / (ones @ np.linalg.solve(C, ones))
-    weights, mean_variance = weights_at_end(variance, wander)
+    weights, mean_variance = average_at_end(variance, wander)
     assert weights == pytest.approx(expected, rel=1e-6, abs=1e-9)
     assert mean_variance == pytest.approx(1 / (ones @ np.linalg.solve(C, ones)), rel=1e-6)
 

@@ -283,9 +283,7 @@ def test_on_the_rail_restarts_of_a_bounded_window_change_nothing(monkeypatch):
 def test_a_window_that_restarts_for_long_counts_each_factor_once(monkeypatch, last, is_bounded):
     """Divergence is pretended at each update of a stretch: where all is linear, restarts change nothing."""
     monkeypatch.setattr(Smoother, "_largest_step", lambda self: np.inf)
-    monkeypatch.setattr(
-        Smoother, "_has_diverged", lambda self: 20 <= gtsam.Symbol(self._newest_pose).index() <= last
-    )
+    monkeypatch.setattr(Smoother, "_has_diverged", lambda self: 20 <= gtsam.Symbol(self._newest_pose).index() <= last)
     solved = counted(monkeypatch, batch_solution, "descended")
     fed, (_, numbers) = on_the_rail(61, 3.1, is_bounded=is_bounded), rail(61)
     assert len(solved) >= last - 20

@@ -16,8 +16,9 @@ from sonar_graph.slam.smoother.factor_store import FactorGroup, Factors
 from sonar_graph.slam.smoother.smoother import (
     BoundedHistory, Changed, Estimates, HistoryParams, Smoother, SmootherParams, WholeHistory,
 )
+from sonar_graph.slam.smoother.variables import Known
 
 __all__ = [
-    "BoundedHistory", "Changed", "Estimates", "FactorGroup", "Factors", "HistoryParams", "JointCovariance",
+    "BoundedHistory", "Changed", "Estimates", "FactorGroup", "Factors", "HistoryParams", "JointCovariance", "Known",
     "Marginals", "Sightline", "Smoother", "SmootherParams", "WholeHistory", "solve", "solve_in_sight",
 ]
