@@ -67,7 +67,7 @@ class PlainIsam2:
         self._graph, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         self._body_T_sonar = calibration.sonar.mounting.pose()
         self._nodes_ns: list[int] = []
-        self._asked: list[tuple[int, int, PreintegratedMotion]] = []
+        self._poses: list[tuple[int, int, PreintegratedMotion]] = []
         """Stamp, pose before it, and the motion from there, of every estimate."""
         self._estimates, self._journal = CausalEstimates(), DetectionJournal()
         self._seen: set[int] = set()
@@ -96,7 +96,7 @@ class PlainIsam2:
                 self._update()
         motion = self._odometry.motion(self._nodes_ns[-1], measurements.end_ns, NO_BIAS)
         A = motion.i_T_j.inverse().AdjointMap()
-        self._asked.append((measurements.end_ns, len(self._nodes_ns) - 1, motion))
+        self._poses.append((measurements.end_ns, len(self._nodes_ns) - 1, motion))
         pose = self._pose.compose(motion.i_T_j)
         estimate = Estimate(measurements.end_ns, pose, A @ self._covariance @ A.T + motion.covariance)
         self._estimates.keep(estimate)
@@ -106,7 +106,7 @@ class PlainIsam2:
         """Smoothed poses at the instants of the estimates."""
         values, marginal = self._isam.calculateEstimate(), cache(lambda node: self._isam.marginalCovariance(X(node)))
         smoothed = CausalEstimates()
-        for stamp_ns, node, motion in self._asked:
+        for stamp_ns, node, motion in self._poses:
             A = motion.i_T_j.inverse().AdjointMap()
             covariance = A @ marginal(node) @ A.T + motion.covariance
             smoothed.keep(Estimate(stamp_ns, values.atPose3(X(node)).compose(motion.i_T_j), covariance))

@@ -1,9 +1,9 @@
 """Errors and NEES after a gap of the Doppler log, during which position fixes arrive.
 
 A slow vehicle of 0.2 m/s on splines (`spline_vehicle`, which shares no code with the library) loses bottom lock 20 s
-after the start for 40 s. Its gyros have a bias, so that the inertial bridge of the gap drifts by tens of metres. Position fixes of
-0.5 m arrive every 5 s throughout (``with fixes``), or not during the gap (``without``). At the first fixes of the gap
-a right estimator makes a correction of many metres.
+after the start for 40 s. Its gyros have a bias, so that the inertial bridge of the gap drifts by tens of metres.
+Position fixes of 0.5 m arrive every 5 s throughout (``with fixes``), or not during the gap (``without``). At the first
+fixes a right estimator makes a correction of many metres.
 
 Position errors and NEES (3 dimensions, divided by 3) are averaged from 3 to 20 s after the gap, over all seeds. NEES
 has an interval from the spread between seeds, because the instants of one run are correlated. ``passed``: with fixes

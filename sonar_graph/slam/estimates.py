@@ -1,7 +1,7 @@
-"""Answers of the estimator: poses at the instants that were asked for, and the solution of the whole graph.
+"""Results of the estimator: poses at the instants of its calls, and the batch solution of the graph.
 
-An instant is tied to the newest keyframe of its time by odometry. While that keyframe may still change, the tie is
-kept. Once it leaves a bounded window, only the pose is kept: 232 bytes an instant.
+An instant is tied to the newest keyframe of its time by odometry. The tie is kept while that keyframe may still change.
+Once it leaves a bounded window, only the pose is kept: 232 bytes for each instant.
 """
 
 from array import array
@@ -15,7 +15,7 @@ import numpy as np
 from gtsam.symbol_shorthand import X
 
 from sonar_graph.navigation import PreintegratedMotion
-from sonar_graph.slam.smoother import JointCovariance, Marginals
+from sonar_graph.slam.smoother import JointCovariance, Known, Marginals
 from sonar_graph.states import Estimate, Trajectory
 
 TRIANGLE = np.tril_indices(6)
@@ -35,20 +35,23 @@ class AnchoredPose:
         """Variables on which the pose depends."""
         return [X(self.keyframe)] if self.bias_key is None else [X(self.keyframe), self.bias_key]
 
-    def carried_on(self, values: gtsam.Values, joint: JointCovariance) -> Estimate:
+    def carried_on(self, values: Known, joint: JointCovariance) -> Estimate:
         """Pose at this instant from the keyframe and the gyro bias, whose error the motion inherits.
 
         ``X Exp(e_X) M Exp(D e_b) = X M Exp(Ad(M^-1) e_X + D e_b)``, so the covariance is ``J P J^T`` with
         ``J = [Ad(M^-1) D]`` and P that of keyframe and bias, plus that of the motion.
         """
-        key, motion = X(self.keyframe), self.motion.i_T_j
+        key = X(self.keyframe)
+        row = joint.rows[key]
+        i_T_j = self.motion.i_T_j
         J = np.zeros((6, len(joint.matrix)))
         if self.bias_key is not None:
-            motion, row = self.motion.corrected(values.atVector(self.bias_key)), joint.rows[self.bias_key]
-            J[:, row : row + len(self.motion.bias)] = self.motion.D_bias
-        J[:, joint.rows[key] : joint.rows[key] + 6] = motion.inverse().AdjointMap()
+            i_T_j = self.motion.corrected(values.atVector(self.bias_key))
+            bias_row = joint.rows[self.bias_key]
+            J[:, bias_row : bias_row + len(self.motion.bias)] = self.motion.D_bias
+        J[:, row : row + 6] = i_T_j.inverse().AdjointMap()
         cov = J @ joint.matrix @ J.T + self.motion.covariance
-        return Estimate(self.stamp_ns, values.atPose3(key).compose(motion), 0.5 * (cov + cov.T))
+        return Estimate(self.stamp_ns, values.atPose3(key).compose(i_T_j), 0.5 * (cov + cov.T))
 
 
 class PoseHistory:
@@ -71,7 +74,7 @@ class PoseHistory:
             self._open.pop()
         self._open.append(instant)
 
-    def leave(self, pose_keys: set[int], values: gtsam.Values, marginals: gtsam.ISAM2) -> None:
+    def leave(self, pose_keys: set[int], values: Known, marginals: gtsam.ISAM2) -> None:
         """Make poses final whose keyframes leave a bounded window: position, quaternion, half of the covariance."""
         count = 0
         while count < len(self._open) and X(self._open[count].keyframe) in pose_keys:
@@ -89,7 +92,7 @@ class PoseHistory:
         count = bisect_left(self._stamps_ns, stamp_ns)
         del self._stamps_ns[:count], self._poses[: 7 * count], self._triangles[: 21 * count]
 
-    def trajectory(self, values: gtsam.Values, marginals: Marginals) -> Trajectory:
+    def trajectory(self, values: Known, marginals: Marginals) -> Trajectory:
         """Poses at all instants."""
         rest = Trajectory.from_estimates(_estimates(self._open, values, marginals))
         n = len(self._stamps_ns)
@@ -107,9 +110,7 @@ class PoseHistory:
         )
 
 
-def _estimates(
-    instants: list[AnchoredPose], values: gtsam.Values, marginals: Marginals | gtsam.ISAM2
-) -> list[Estimate]:
+def _estimates(instants: list[AnchoredPose], values: Known, marginals: Marginals | gtsam.ISAM2) -> list[Estimate]:
     estimates = []
     for _, on_one in groupby(instants, key=lambda instant: instant.keyframe):
         together = list(on_one)
@@ -121,7 +122,7 @@ def _estimates(
 class Solution(NamedTuple):
     """Solution of the whole graph."""
 
-    values: gtsam.Values
+    values: Known
     marginals: Marginals
     ids: list[int]
     """Landmarks in it, ascending."""

@@ -1,17 +1,17 @@
-"""The smoothing estimator: keyframes, landmarks and gyro bias in one incrementally solved graph (docs/theory/isam2.md).
+"""The smoothing estimator: keyframes, landmarks and biases in one incrementally solved graph (docs/theory/isam2.md).
 
 One call of `Isam2.process`::
 
-    odometry ── epochs due as keyframes ──► preintegration ──► factors of each keyframe
+    odometry ──► epochs due as keyframes ──► preintegration ──► factors of each keyframe
     frames of detections ──► newest keyframe, or a new one ──► identity ──► gate ──► sighting factors
-    one update of the smoother, if there is anything new
-    newest keyframe's estimate, carried on by odometry ──► Estimate at end_ns
+    one update of the smoother, if anything is new
+    estimate of the newest keyframe, carried on by odometry ──► Estimate at end_ns
 """
 
 from bisect import bisect_left
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import partial
-from typing import Any, ClassVar, Literal, Self, get_args
+from typing import Any, ClassVar, Literal, NamedTuple, Self, get_args
 
 import gtsam
 import numpy as np
@@ -20,7 +20,15 @@ from pydantic import model_validator
 
 from sonar_graph.calibration import Calibration, Section, require_params
 from sonar_graph.errors import CalibrationError, EstimatorError
-from sonar_graph.measurements import NS_PER_S, Floats, Ints, Measurements, PositionFixes, require_measurements
+from sonar_graph.measurements import (
+    NS_PER_S,
+    Floats,
+    Ints,
+    LandmarkDetections,
+    Measurements,
+    PositionFixes,
+    require_measurements,
+)
 from sonar_graph.models import KernelParams, RobustKernel
 from sonar_graph.motion import MotionSource, require_source
 from sonar_graph.slam.estimates import AnchoredPose, PoseHistory
@@ -30,6 +38,7 @@ from sonar_graph.slam.landmarks import IdentityParams, MixtureIdentity, RobustId
 from sonar_graph.slam.smoother import (
     HistoryParams,
     JointCovariance,
+    Known,
     Marginals,
     Smoother,
     SmootherParams,
@@ -81,6 +90,13 @@ class Isam2Params(Section):
         return self
 
 
+class Event(NamedTuple):
+    """A frame or a fix, and the call that takes it in."""
+
+    stamp_ns: int
+    apply: Callable[[], None]
+
+
 class Isam2:
     """Landmark SLAM by incremental smoothing (Kaess et al., iSAM2, IJRR 31(2), 2012).
 
@@ -113,22 +129,12 @@ class Isam2:
     def __init__(self, calibration: Calibration, odometry: MotionSource, params: Any = None) -> None:
         require_params(params, self.Params, "isam2")
         require_source(odometry, calibration, "Isam2(calibration, odometry, params)")
-        noise = {
-            "imu.gyro_noise_density": calibration.imu.gyro_noise_density,
-            "dvl.velocity_sigma_m_s": min(calibration.dvl.velocity_sigma_m_s),
-            "start.position_sigma_m": min(calibration.start.position_sigma_m),
-            "start.rpy_sigma_rad": min(calibration.start.rpy_sigma_rad),
-        }
-        if zero := [name for name, least in noise.items() if least <= 0]:  # a graph weighs by inverse variances
-            raise CalibrationError(
-                f"isam2: {', '.join(zero)} must be above zero; give a small value for what is known well"
-            )
-        p: Isam2Params = params or Isam2Params()
-        self._params = p
-        self._asked = PoseHistory()
-        self._smoother = Smoother(p.smoother, p.history, self._asked)
-        self._keyframes = Keyframes(calibration, odometry, p.keyframes, self._smoother)
-        self._sightings = Frontend(p.identity, p.kernel, self._keyframes)
+        require_noise(calibration)
+        self._params: Isam2Params = params or Isam2Params()
+        self._poses = PoseHistory()
+        self._smoother = Smoother(self._params.smoother, self._params.history, self._poses)
+        self._keyframes = Keyframes(calibration, odometry, self._params.keyframes, self._smoother)
+        self._frontend = Frontend(self._params.identity, self._params.kernel, self._keyframes)
 
     @property
     def graph(self) -> gtsam.NonlinearFactorGraph:
@@ -155,54 +161,73 @@ class Isam2:
         """
         require_measurements(measurements, "isam2")
         self._keyframes.add(measurements.imu, measurements.dvl, measurements.depth, measurements.heading)
-        fixes = [] if measurements.positions is None else self._fixes(measurements.positions)
-        if self._asked.newest_ns is not None and measurements.end_ns < self._asked.newest_ns:
-            for _, take_in in fixes:
-                take_in()
-            if measurements.detections is not None:
-                stamps_ns, ids = measurements.detections.stamps_ns, measurements.detections.most_probable()[0]
-                for stamp_ns, landmark_id in zip(stamps_ns.tolist(), ids.tolist(), strict=True):
-                    self._sightings.journal.record(stamp_ns, landmark_id, Outcome.LATE)
+        events = self._fix_events(measurements.positions)
+        is_late = self._poses.newest_ns is not None and measurements.end_ns < self._poses.newest_ns
+        if is_late:
+            for event in events:
+                event.apply()
+            self._refuse_late(measurements.detections)
             return None
-        frames = [] if measurements.detections is None else list(measurements.detections.frames())
-        for stamp_ns, take_in in sorted(
-            [(int(frame.stamps_ns[0]), partial(self._sightings.add, frame)) for frame in frames] + fixes,
-            key=lambda event: event[0],
-        ):
-            self._sightings.advance(stamp_ns)
-            take_in()
-        self._sightings.advance(measurements.end_ns)
+        events = self._frame_events(measurements.detections) + events
+        for event in sorted(events, key=lambda event: event.stamp_ns):
+            self._frontend.advance(event.stamp_ns)
+            event.apply()
+        self._frontend.advance(measurements.end_ns)
         if self._keyframes.newest_ns is None:
             return None
         self._forget()
-        motion = self._keyframes.motion_since_newest(measurements.end_ns)
-        newest = len(self._keyframes.stamps_ns) - 1
-        instant = AnchoredPose(measurements.end_ns, newest, self._keyframes.bias_keys[newest], motion)
-        self._asked.add(instant)
-        return instant.carried_on(self._smoother.estimates, self._smoother.joint_covariance(instant.keys()))
+        return self._estimate(measurements.end_ns)
 
-    def _fixes(self, positions: PositionFixes) -> list[tuple[int, partial[None]]]:
-        """What to do with each sound position fix, with its stamp."""
-        sigma_m = self._keyframes.calibration.positions.sigma_m
-        found: list[tuple[int, partial[None]]] = []
-        known = zip(positions.stamps_ns.tolist(), positions.are_sound().tolist(), strict=True)
-        for k, (stamp_ns, is_sound) in enumerate(known):
-            if not is_sound:
+    def _estimate(self, stamp_ns: int) -> Estimate:
+        """Estimate at an instant: the newest keyframe's pose, carried on by odometry."""
+        newest = self.keyframe_count - 1
+        motion = self._keyframes.motion_since_newest(stamp_ns)
+        instant = AnchoredPose(stamp_ns, newest, self._keyframes.bias_keys[newest], motion)
+        self._poses.add(instant)
+        joint = self._smoother.joint_covariance(instant.keys())
+        return instant.carried_on(self._smoother.estimates, joint)
+
+    def _frame_events(self, detections: LandmarkDetections | None) -> list[Event]:
+        """Frames of detections, each with the call that takes it in."""
+        if detections is None:
+            return []
+        return [Event(int(frame.stamps_ns[0]), partial(self._frontend.add, frame)) for frame in detections.frames()]
+
+    def _fix_events(self, positions: PositionFixes | None) -> list[Event]:
+        """Valid position fixes, each with the call that adds it to the graph."""
+        if positions is None:
+            return []
+        known = self._keyframes.calibration.positions
+        is_sound = positions.are_sound()
+        events = []
+        for k, stamp_ns in enumerate(positions.stamps_ns.tolist()):
+            if not is_sound[k]:
                 self._keyframes.refuse("positions", stamp_ns, Refusal.UNSOUND)
                 continue
             cov_m2 = positions.covariance_m2[k]
-            cov_m2 = np.diag(np.square(sigma_m)) if np.isnan(cov_m2).any() else cov_m2
-            found.append((stamp_ns, partial(self._sightings.add_fix, stamp_ns, positions.position_m[k], cov_m2)))
-        return found
+            if np.isnan(cov_m2).any():
+                cov_m2 = np.diag(np.square(known.sigma_m))
+            events.append(Event(stamp_ns, partial(self._frontend.add_fix, stamp_ns, positions.position_m[k], cov_m2)))
+        return events
+
+    def _refuse_late(self, detections: LandmarkDetections | None) -> None:
+        """Record the detections of a call whose end is before that of an earlier call."""
+        if detections is None:
+            return
+        ids, _ = detections.most_probable()
+        for stamp_ns, landmark_id in zip(detections.stamps_ns.tolist(), ids.tolist(), strict=True):
+            self._frontend.journal.record(stamp_ns, landmark_id, Outcome.LATE)
 
     def _forget(self) -> None:
         """Drop old poses and outcomes of a bounded history, in batches."""
-        history, now_ns = self._params.history, self._keyframes.stamps_ns[-1]
-        if history.policy == "bounded" and history.remembered_s is not None:
-            batch_ns = round(history.remembered_s * NS_PER_S / 4)
-            oldest_ns = (now_ns // batch_ns - 4) * batch_ns  # by the newest keyframe, however the log is cut
-            self._asked.forget_before(oldest_ns)
-            self._sightings.journal.forget_before(oldest_ns)
+        history = self._params.history
+        if history.policy != "bounded" or history.remembered_s is None:
+            return
+        batch_ns = round(history.remembered_s * NS_PER_S / 4)
+        # by the newest keyframe, so that it does not depend on how the log is cut into calls
+        oldest_ns = (self._keyframes.stamps_ns[-1] // batch_ns - 4) * batch_ns
+        self._poses.forget_before(oldest_ns)
+        self._frontend.journal.forget_before(oldest_ns)
 
     def keyframe_stamps(self) -> Ints:
         """Stamps of the keyframes, shape (n,), nanoseconds."""
@@ -239,18 +264,15 @@ class Isam2:
     ) -> JointCovariance:
         """Joint covariance of keyframes, by their numbers or stamps, and of landmarks, by their identities.
 
-        Poses between keyframes: `trajectory` has their covariances, one by one. Cost, with 20 landmarks after 34
-        minutes: 0.1 ms for one variable and 0.6 ms for the newest keyframe with all landmarks over the window; over the
-        history 1 s for its solution, once until there are new measurements, then 3 ms for any one variable and 40 ms
-        for fifty keyframes together (docs/theory/isam2.md).
+        For poses between keyframes, `trajectory` has their covariances, one by one. Over the history the first question
+        after new measurements solves the whole graph.
 
         Parameters
         ----------
         over
-            "window": from iSAM2, as of its last update, linearised within ``relinearize_threshold`` of the estimate;
-            what marginals touch, landmarks above all, stays linearised where it was when they were made. Only of what
-            is in the window. "history": from the solution of the whole graph, linearised there, of anything; with a
-            bounded history from the solution of the window's graph.
+            "window": from iSAM2, as of its last update, linearised within ``relinearize_threshold`` of the estimate.
+            "history": from the batch solution of the graph, linearised there. With a bounded history both know the
+            variables of the window only.
 
         Returns
         -------
@@ -264,43 +286,52 @@ class Isam2:
         """
         if over not in get_args(Over):
             raise EstimatorError(f'isam2: over is {over!r}; expected "window" or "history"')
-        asked: list[list[int]] = []
-        for field, given in (("keyframes", keyframes), ("stamps_ns", stamps_ns), ("landmarks", landmarks)):
-            found = np.asarray(list(given) if isinstance(given, Iterable) else given)
-            if found.ndim != 1 or (found.size and found.dtype.kind not in "iu"):
-                raise EstimatorError(f"isam2: {field}: expected a list of integers, such as [1, 2], not {given!r}")
-            asked.append(found.tolist())
-        smoother, existing_ns, poses = self._smoother, self._keyframes.stamps_ns, asked[0]
-        newest = len(existing_ns) - 1
-        for stamp_ns in asked[1]:
-            place = bisect_left(existing_ns, stamp_ns)
-            if existing_ns[place : place + 1] != [stamp_ns]:
-                beside = " and ".join(str(stamp) for stamp in existing_ns[max(place - 1, 0) : place + 1])
-                nearest = f"the nearest are at {beside} ns" if beside else "there is none yet"
-                raise EstimatorError(f"isam2: no keyframe at {stamp_ns} ns; {nearest}")
-            poses.append(place)
-        for number in poses:
-            if not 0 <= number <= newest:
-                known = f"it has 0 to {newest}" if existing_ns else "none was set yet"
-                raise EstimatorError(f"isam2: there is no keyframe {number}; {known}")
-        ids = smoother.landmark_ids if over == "window" else self._sightings.smoothed().ids
-        if unknown := [i for i in asked[2] if i not in set(ids)]:
-            listed = ", ".join(map(str, ids[:MOST_LISTED])) + (", ..." if len(ids) > MOST_LISTED else "")
-            raise EstimatorError(f"isam2: landmark {unknown[0]} is not in the graph; it holds {listed or 'none yet'}")
-        keys = list(dict.fromkeys([*map(X, poses), *map(L, asked[2])]))
+        numbers = whole_numbers("keyframes", keyframes)
+        numbers += [self._keyframe_at(stamp_ns) for stamp_ns in whole_numbers("stamps_ns", stamps_ns)]
+        ids = whole_numbers("landmarks", landmarks)
+        self._require_keyframes(numbers)
+        self._require_landmarks(ids, over)
+        keys = {*map(X, numbers), *map(L, ids)}
         if not keys:
             raise EstimatorError("isam2: the covariance of nothing was asked for; give keyframes, stamps or landmarks")
-        held = set(smoother.in_window(keys))
-        left = [number for number in dict.fromkeys(poses) if X(number) not in held]
-        if left and (over == "window" or smoother.is_bounded):
-            first = next((k for k in range(newest) if smoother.in_window([X(k)])), newest)
-            instead = "none is known any more" if smoother.is_bounded else 'ask over="history" for older ones'
+        self._require_in_window(numbers)
+        marginals = self._smoother.marginals if over == "window" else self._frontend.smoothed().marginals
+        return JointCovariance.of(marginals, sorted(keys))
+
+    def _keyframe_at(self, stamp_ns: int) -> int:
+        """Number of the keyframe at a stamp; an `EstimatorError` names the nearest ones where there is none."""
+        existing_ns = self._keyframes.stamps_ns
+        place = bisect_left(existing_ns, stamp_ns)
+        if existing_ns[place : place + 1] == [stamp_ns]:
+            return place
+        beside = " and ".join(str(stamp) for stamp in existing_ns[max(place - 1, 0) : place + 1])
+        nearest = f"the nearest are at {beside} ns" if beside else "there is none yet"
+        raise EstimatorError(f"isam2: no keyframe at {stamp_ns} ns; {nearest}")
+
+    def _require_keyframes(self, numbers: list[int]) -> None:
+        newest = self.keyframe_count - 1
+        for number in numbers:
+            if not 0 <= number <= newest:
+                known = f"it has 0 to {newest}" if newest >= 0 else "none was set yet"
+                raise EstimatorError(f"isam2: there is no keyframe {number}; {known}")
+
+    def _require_landmarks(self, ids: list[int], over: Over) -> None:
+        known = self._smoother.landmark_ids if over == "window" else self._frontend.smoothed().ids
+        unknown = [landmark_id for landmark_id in ids if landmark_id not in set(known)]
+        if unknown:
+            listed = ", ".join(map(str, known[:MOST_LISTED])) + (", ..." if len(known) > MOST_LISTED else "")
+            raise EstimatorError(f"isam2: landmark {unknown[0]} is not in the graph; it holds {listed or 'none yet'}")
+
+    def _require_in_window(self, numbers: list[int]) -> None:
+        """Refuse keyframes that have left a bounded window."""
+        newest = self.keyframe_count - 1
+        left = [number for number in numbers if not self._smoother.in_window([X(number)])]
+        if left:
+            first = next((k for k in range(newest) if self._smoother.in_window([X(k)])), newest)
             raise EstimatorError(
-                f"isam2: keyframe {left[0]} has left the window, which holds {first} to {newest}; {instead}"
+                f"isam2: keyframe {left[0]} has left the window, which holds {first} to {newest}; none is known any"
+                ' more; history.policy = "whole" keeps all'
             )
-        if over == "window":
-            return JointCovariance.of(smoother.marginals, sorted(keys))
-        return JointCovariance.of(self._sightings.smoothed().marginals, sorted(keys))
 
     def trajectory(self) -> Trajectory:
         """The smoothed pose at every instant at which `process` returned an estimate.
@@ -310,12 +341,12 @@ class Isam2:
         Doubtful identities are those that fit the whole history best, chosen beside the run, which asking leaves as it
         was.
         """
-        values, marginals, _ = self._sightings.smoothed()
-        return self._asked.trajectory(values, marginals)
+        values, marginals, _ = self._frontend.smoothed()
+        return self._poses.trajectory(values, marginals)
 
     def landmarks(self) -> LandmarkMap:
         """Landmarks by identity after solving the whole graph, with marginal covariances."""
-        return map_of(*self._sightings.smoothed())
+        return map_of(*self._frontend.smoothed())
 
     def newest_landmarks(self) -> LandmarkMap:
         """Landmarks by identity as of the last update of iSAM2, in milliseconds however long the run is.
@@ -328,7 +359,7 @@ class Isam2:
 
     def detections(self) -> DetectionLog:
         """Outcome of each detection; of doubtful identities in the history of `trajectory`."""
-        return self._sightings.log()
+        return self._frontend.log()
 
     def withheld(self) -> list[str]:
         """What could not be used, a line each: headings and fixes that the estimate contradicts, then newest factors.
@@ -342,7 +373,31 @@ class Isam2:
         return self._keyframes.refused
 
 
-def map_of(values: gtsam.Values, marginals: Marginals | gtsam.ISAM2, ids: list[int]) -> LandmarkMap:
+def require_noise(calibration: Calibration) -> None:
+    """Refuse noise of zero: a graph weighs by inverse variances."""
+    sigmas = {
+        "imu.gyro_noise_density": calibration.imu.gyro_noise_density,
+        "dvl.velocity_sigma_m_s": min(calibration.dvl.velocity_sigma_m_s),
+        "start.position_sigma_m": min(calibration.start.position_sigma_m),
+        "start.rpy_sigma_rad": min(calibration.start.rpy_sigma_rad),
+    }
+    zero = [name for name, least in sigmas.items() if least <= 0]
+    if zero:
+        raise CalibrationError(
+            f"isam2: {', '.join(zero)} must be above zero; give a small value for what is known well"
+        )
+
+
+def whole_numbers(field: str, given: Iterable[int]) -> list[int]:
+    """A list of integers, or an `EstimatorError` that names the field."""
+    found = np.asarray(list(given) if isinstance(given, Iterable) else given)
+    if found.ndim != 1 or (found.size and found.dtype.kind not in "iu"):
+        raise EstimatorError(f"isam2: {field}: expected a list of integers, such as [1, 2], not {given!r}")
+    numbers: list[int] = found.tolist()
+    return numbers
+
+
+def map_of(values: Known, marginals: Marginals | gtsam.ISAM2, ids: list[int]) -> LandmarkMap:
     """Map of landmarks with these identities, from a solution and what gives its marginal covariances."""
     return LandmarkMap(
         np.array(ids, dtype=np.int64),

@@ -77,7 +77,7 @@ def test_smoothed_poses_are_better_than_causal_ones_and_worse_than_those_of_the_
 
 def held(estimator: Isam2) -> dict[str, int]:
     """Sizes of all that could grow with the run."""
-    smoother, sightings = estimator._smoother, estimator._sightings
+    smoother, sightings = estimator._smoother, estimator._frontend
     window = smoother._window
     return {
         "values": smoother.values.size(),
@@ -88,7 +88,7 @@ def held(estimator: Isam2) -> dict[str, int]:
         "sightlines": sum(map(len, smoother._store.sightlines().values())),
         "sightings": sum(len(seen) for seen in sightings.landmarks._of.values()),
         "tracks": sum(len(t.waiting) + len(t.settled) for t in sightings.policy._tracks.values()),
-        "asked": len(estimator._asked._open),
+        "asked": len(estimator._poses._open),
     }
 
 

@@ -10,7 +10,7 @@ from sonar_graph.slam import factors
 from sonar_graph.slam.smoother import Smoother, batch_solution
 from sonar_graph.slam.smoother.batch_solution import solve
 from sonar_graph.slam.smoother.factor_store import FactorGroup
-from sonar_graph.slam.smoother.window import FixedLagWindow, WholeWindow
+from sonar_graph.slam.smoother.window import WholeWindow
 
 from .fed import FOREVER_S, NEVER_M, SONAR, Fed, assert_is_least_squares, in_the_basin, on_the_rail, ranged
 from .graphs import block_of, off_sigmas
@@ -282,7 +282,7 @@ def test_on_the_rail_restarts_of_a_bounded_window_change_nothing(monkeypatch):
 @pytest.mark.parametrize("last", [20, 40, 60])
 def test_a_window_that_restarts_for_long_counts_each_factor_once(monkeypatch, last, is_bounded):
     """Divergence is pretended at each update of a stretch: where all is linear, restarts change nothing."""
-    monkeypatch.setattr(Smoother, "_largest_step", lambda self: np.inf)
+    monkeypatch.setattr(Smoother, "_largest_step", lambda _: np.inf)
     monkeypatch.setattr(Smoother, "_has_diverged", lambda self: 20 <= gtsam.Symbol(self._newest_pose).index() <= last)
     solved = counted(monkeypatch, batch_solution, "descended")
     fed, (_, numbers) = on_the_rail(61, 3.1, is_bounded=is_bounded), rail(61)

@@ -222,7 +222,7 @@ def test_a_track_that_is_over_decides_no_longer_which_of_its_rows_counts(asked: 
 def test_the_journal_says_of_each_sighting_in_the_graph_what_it_is_of(policy: str):
     sequence = simulate_basin(BasinOptions(**BASIN, **TROUBLES["late and wrong"], anonymous_share=0.3))
     estimator = run(sequence, **POLICIES[policy])
-    landmarks = estimator._sightings.landmarks
+    landmarks = estimator._frontend.landmarks
     log, inside = landmarks.journal.log(), {s.row: i for i in landmarks.ids for s in landmarks.sightings(i)}
     for row, landmark_id in inside.items():
         assert (log.landmark_ids[row], log.outcomes[row] in IN_GRAPH) == (landmark_id, True)
