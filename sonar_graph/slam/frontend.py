@@ -88,8 +88,10 @@ class Frontend:
             while not later.is_empty:
                 self._apply(later)
                 later = policy.reconsider()
-            judged = [each.sighting for assignments in decision.rounds for each in assignments]
-            taken |= {i for i in map(self.landmarks.landmark_of, judged) if i is not None}
+            for each in decision.assignments:
+                landmark_id = self.landmarks.state(each.sighting).landmark_id
+                if landmark_id is not None:  # it is None where the smoother withheld the sighting
+                    taken.add(landmark_id)
 
     def add_fix(self, stamp_ns: int, position_m: Floats, cov_m2: Floats) -> None:
         """Add a position fix, which enters the estimate at once if it adds enough information."""

@@ -78,7 +78,7 @@ def max_mixture(world: Dive) -> gtsam.NonlinearFactorGraph:
     """The same with Python factors that look for their largest component at every linearisation."""
     policy = world.sightings.policy
     landmarks = world.sightings.landmarks
-    handles = {landmarks.handle(s) for w in policy.objects for s in w.sightings} - {None}
+    handles = {landmarks.state(s).handle for w in policy.objects for s in w.sightings} - {None}
     graph, chosen = world.smoother.graph_without(handles), policy.history()
     pairs = list(zip(chosen.objects, chosen.choices, strict=True))
     firsts = {i: min(w.sightings[0].row for w, choice in pairs if choice == i) for i in PLACES}

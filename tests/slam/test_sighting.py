@@ -52,7 +52,7 @@ def change(landmarks: LandmarkGraph, changes: list[tuple[Sighting, int | None]])
     later = {Outcome.WAITING: Outcome.USED_LATER}
     landmarks.apply(
         [
-            Assignment(s, later.get(landmarks.outcome(s), Outcome.MOVED) if i else Outcome.TAKEN_BACK, i)
+            Assignment(s, later.get(landmarks.state(s).outcome, Outcome.MOVED) if i else Outcome.TAKEN_BACK, i)
             for s, i in changes
         ],
         float(POSES),
@@ -82,7 +82,7 @@ def test_whatever_came_and_went_the_graph_is_that_of_what_is_left(floor: FloorPr
     landmarks = begun()
     seen, of = [sighting_of(7, k, floor, landmarks) for k in range(POSES)], dict[Sighting, int]()
     for stage in stages:
-        change(landmarks, [(s, i) for s, i in zip(seen, stage, strict=True) if landmarks.landmark_of(s) != i])
+        change(landmarks, [(s, i) for s, i in zip(seen, stage, strict=True) if landmarks.state(s).landmark_id != i])
         of = {s: i for s, i in zip(seen, stage, strict=True) if i is not None}
         expected, ids = graph_of(landmarks.smoother.graph.at(k) for k in range(POSES)), sorted(set(of.values()))
         for i in ids:
@@ -102,11 +102,11 @@ def test_what_is_said_once_is_said_by_the_earliest(earliest_first: bool) -> None
     for s in (early, middle, late) if earliest_first else (late, middle, early):
         change(landmarks, [(s, 7)])
     store = landmarks.smoother._store
-    counts = [len(store.factors([landmarks.handle(s)])) for s in (early, middle, late)]
+    counts = [len(store.factors([landmarks.state(s).handle])) for s in (early, middle, late)]
     assert counts == [3, 2, 2]  # first_direction beside range and azimuth
     change(landmarks, [(early, None)])
-    assert landmarks.handle(early) is None
-    assert [len(store.factors([landmarks.handle(s)])) for s in (middle, late)] == [3, 2]
+    assert landmarks.state(early).handle is None
+    assert [len(store.factors([landmarks.state(s).handle])) for s in (middle, late)] == [3, 2]
 
 
 def test_a_landmark_whose_sightings_have_left_counts_as_one_more() -> None:
@@ -141,10 +141,10 @@ def test_a_state_that_may_not_follow_is_refused_and_changes_nothing(before: list
     sighting = sighting_of(7, 0, None, landmarks)
     for outcome in before:
         landmarks.apply([Assignment(sighting, outcome, 7)], float(POSES))
-    state, outcomes = landmarks.outcome(sighting), landmarks.journal.log().outcomes
+    state, outcomes = landmarks.state(sighting).outcome, landmarks.journal.log().outcomes
     with pytest.raises(AssertionError, match="cannot become"):
         landmarks.apply([Assignment(sighting, after, 7)], float(POSES))
-    assert (landmarks.outcome(sighting), landmarks.ids, landmarks.journal.log().outcomes) == (state, [], outcomes)
+    assert (landmarks.state(sighting).outcome, landmarks.ids, landmarks.journal.log().outcomes) == (state, [], outcomes)
 
 
 MOUNTED = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.0, 0.4, 0.0), np.array([0.3, 0.0, -0.1]))

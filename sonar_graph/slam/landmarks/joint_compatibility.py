@@ -56,6 +56,11 @@ class Innovations:
             C[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += self.noise[i]
         return e, C
 
+    def pairing(self, landmarks: tuple[int, ...]) -> Pairing:
+        """Pairing of these landmarks with its D²."""
+        e, C = self.of(landmarks)
+        return Pairing(landmarks, float(e @ np.linalg.solve(C, e)))
+
     def distances(self) -> Floats:
         """D² of each detection with each landmark alone, shape (m, n)."""
         n = self.innovation.shape[1]
@@ -76,23 +81,8 @@ def pair_jointly(innovations: Innovations, probability: float) -> Pairing:
     freedom.
     """
     search = _Search(innovations, probability)
-    search.branch(0, _Whitened(search.best.landmarks, [], np.zeros((0, 0)), np.zeros(0), 0.0))
+    search.branch(0, search.best)
     return search.best
-
-
-@dataclass(frozen=True, eq=False)
-class _Whitened:
-    """A partial hypothesis: ``L L' = C`` and ``w = L^-1 e``, so that ``D² = w' w``."""
-
-    landmarks: tuple[int, ...]
-    rows: list[int]
-    L: Floats
-    w: Floats
-    distance: float
-
-    @property
-    def size(self) -> int:
-        return len(self.rows) // 2
 
 
 class _Search:
@@ -102,48 +92,33 @@ class _Search:
         count = len(innovations.innovation)
         self._innovations = innovations
         self._gates = [0.0] + [gate_threshold(probability, 2 * (k + 1)) for k in range(count)]
-        distances = innovations.distances()
-        self._possible = [[j for j in np.argsort(row).tolist() if row[j] <= self._gates[1]] for row in distances]
+        # a pair that is incompatible alone stays so in every pairing
+        self._possible = [
+            [j for j in np.argsort(row).tolist() if row[j] <= self._gates[1]] for row in innovations.distances()
+        ]
         self._order = sorted(range(count), key=lambda i: (len(self._possible[i]) == 0, len(self._possible[i])))
         self._left = [sum(bool(self._possible[i]) for i in self._order[depth:]) for depth in range(count + 1)]
         """Number of detections at each depth and below that are compatible with a landmark."""
         self.best = Pairing((UNPAIRED,) * count, 0.0)
-        self._best_size = 0
 
-    def branch(self, depth: int, found: _Whitened) -> None:
-        """Try all pairings that extend a partial hypothesis."""
-        is_better = (found.size, -found.distance) > (self._best_size, -self.best.distance)
-        if is_better and found.distance <= self._gates[found.size]:
-            self.best = Pairing(found.landmarks, found.distance)
-            self._best_size = found.size
-        reach = found.size + self._left[depth]
+    def branch(self, depth: int, part: Pairing) -> None:
+        """Try all pairings that extend a part of one."""
+        best = self.best
+        if (part.size, -part.distance) > (best.size, -best.distance) and part.distance <= self._gates[part.size]:
+            self.best = part
+        if self._left[depth] == 0:
+            return
         # bound: D² only grows with pairs, so that a pairing of equal size cannot come below it any more
-        is_hopeless = reach < self._best_size or (reach == self._best_size and found.distance >= self.best.distance)
-        if self._left[depth] == 0 or is_hopeless:
+        reach = part.size + self._left[depth]
+        if (reach, -part.distance) <= (self.best.size, -self.best.distance):
             return
         i = self._order[depth]
         for j in self._possible[i]:
-            if j not in found.landmarks:
-                more = self._with_pair(found, i, j)
+            if j not in part.landmarks:
+                more = self._innovations.pairing((*part.landmarks[:i], j, *part.landmarks[i + 1 :]))
                 if more.distance <= self._gates[reach]:
                     self.branch(depth + 1, more)
-        self.branch(depth + 1, found)
-
-    def _with_pair(self, found: _Whitened, i: int, j: int) -> _Whitened:
-        """Add a pair, by a block of the Cholesky factor."""
-        P = self._innovations.expected_cov
-        rows = [2 * j, 2 * j + 1]
-        k = len(found.rows)
-        across = np.linalg.solve(found.L, P[np.ix_(found.rows, rows)]) if k else np.zeros((0, 2))
-        corner = np.linalg.cholesky(P[np.ix_(rows, rows)] + self._innovations.noise[i] - across.T @ across)
-        w = np.linalg.solve(corner, self._innovations.innovation[i, j] - across.T @ found.w)
-        L = np.zeros((k + 2, k + 2))
-        L[:k, :k] = found.L
-        L[k:, :k] = across.T
-        L[k:, k:] = corner
-        landmarks = (*found.landmarks[:i], j, *found.landmarks[i + 1 :])
-        distance = found.distance + float(w @ w)
-        return _Whitened(landmarks, found.rows + rows, L, np.concatenate([found.w, w]), distance)
+        self.branch(depth + 1, part)
 
 
 def drop_unlikely(innovations: Innovations, pairing: Pairing, log_rivals: Floats) -> Pairing:
@@ -176,7 +151,7 @@ def drop_unlikely(innovations: Innovations, pairing: Pairing, log_rivals: Floats
         worst = int(np.argmin(excess))
         if excess[worst] > 0:
             is_likely = log_density(e, C) > float(log_rivals[paired].sum())
-            return Pairing(landmarks, float(e @ np.linalg.solve(C, e))) if is_likely else nothing
+            return innovations.pairing(landmarks) if is_likely else nothing
         landmarks = tuple(UNPAIRED if i == paired[worst] else j for i, j in enumerate(landmarks))
     return nothing
 

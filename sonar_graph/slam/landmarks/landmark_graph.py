@@ -86,6 +86,11 @@ class Decision:
         return cls((one_round,)) if one_round else UNCHANGED
 
     @property
+    def assignments(self) -> list[Assignment]:
+        """All rounds together."""
+        return [each for one_round in self.rounds for each in one_round]
+
+    @property
     def is_empty(self) -> bool:
         """True when nothing changes."""
         return not self.rounds and not self.settles
@@ -190,15 +195,18 @@ class AmendableJournal(DetectionJournal):
         self._innovation_covs[4 * row : 4 * row + 4] = array("d", S)
 
 
-@dataclass(slots=True)
-class _State:
+class State(NamedTuple):
     """What has become of a sighting so far."""
 
     outcome: Outcome | None = None
+    """None: not judged yet."""
     landmark_id: int | None = None
-    """Landmark of which it is a sighting in the graph."""
+    """Landmark of which it is a sighting; None where it is not in the graph."""
     handle: int | None = None
-    """Handle of its factors in the smoother."""
+    """Handle of its factors in the smoother; None where they wait for one, or it is not in the graph."""
+
+
+UNJUDGED = State()
 
 
 class LandmarkGraph:
@@ -208,7 +216,7 @@ class LandmarkGraph:
         self.smoother = smoother
         self.factors = factors
         self.journal = journal
-        self._states: dict[Sighting, _State] = defaultdict(_State)
+        self._states: dict[Sighting, State] = {}
         self._of: dict[int, dict[Sighting, None]] = defaultdict(dict)
         """Sightings of each landmark, in the order in which they came."""
         self._rooted: dict[int, Sighting] = {}
@@ -222,17 +230,9 @@ class LandmarkGraph:
     def __contains__(self, landmark_id: object) -> bool:
         return landmark_id in self._of
 
-    def outcome(self, sighting: Sighting) -> Outcome | None:
-        """State of a sighting; None: not judged yet, or no longer needed."""
-        return self._states[sighting].outcome if sighting in self._states else None
-
-    def landmark_of(self, sighting: Sighting) -> int | None:
-        """Landmark of a sighting that is in the graph, else None."""
-        return self._states[sighting].landmark_id if sighting in self._states else None
-
-    def handle(self, sighting: Sighting) -> int | None:
-        """Handle of the factors of a sighting that is in the graph, else None."""
-        return self._states[sighting].handle if sighting in self._states else None
+    def state(self, sighting: Sighting) -> State:
+        """State of a sighting, as long as it may change."""
+        return self._states.get(sighting, UNJUDGED)
 
     def sightings(self, landmark_id: int) -> list[Sighting]:
         """Sightings of a landmark that can be retracted."""
@@ -268,7 +268,7 @@ class LandmarkGraph:
         retracted: list[Sighting] = []
         associated: list[tuple[Sighting, int]] = []
         for each in assignments:
-            state = self._states[each.sighting]
+            state = self.state(each.sighting)
             if each.outcome not in LATER.get(state.outcome, ()):
                 raise AssertionError(f"a sighting that is {state.outcome!r} cannot become {each.outcome!r}")
             self.journal.amend(each)
@@ -279,7 +279,7 @@ class LandmarkGraph:
                     added.append(each)
                 else:
                     associated.append((each.sighting, each.landmark_id))
-            state.outcome = each.outcome
+            self._states[each.sighting] = state._replace(outcome=each.outcome)
             if each.outcome not in LATER:
                 del self._states[each.sighting]
         for each in added:
@@ -307,7 +307,7 @@ class LandmarkGraph:
         withheld = [s for s, state in self._states.items() if state.handle in changed.withheld]
         for sighting in withheld:
             self._remove(sighting)
-            self._states[sighting].outcome = Outcome.WITHHELD
+            self._states[sighting] = State(Outcome.WITHHELD)
             self.journal.amend(Assignment(sighting, Outcome.WITHHELD))
         for landmark_id, sightings in self._of.items():
             for sighting in [s for s in sightings if s.line.pose_key in changed.left]:
@@ -339,12 +339,12 @@ class LandmarkGraph:
         self.follow(self.smoother.flush(time_s))
         old_of: dict[Sighting, int] = {}
         for sighting in retracted:
-            landmark_id = self.landmark_of(sighting)
+            landmark_id = self.state(sighting).landmark_id
             if landmark_id is not None:  # the flush may have withheld it
                 old_of[sighting] = landmark_id
         new_of = dict(associated)
         first_before = {i: self._first(i) for i in sorted({*old_of.values(), *new_of.values()})}
-        removed = [self.handle(sighting) for sighting in old_of]
+        removed = [self.state(sighting).handle for sighting in old_of]
         for sighting in old_of:
             self._remove(sighting)
         for sighting, new_id in new_of.items():
@@ -356,9 +356,9 @@ class LandmarkGraph:
             for i, before in first_before.items()
             if first[i] is not before
             for s in (before, first[i])
-            if s is not None and s not in new_of and self.landmark_of(s) == i
+            if s is not None and s not in new_of and self.state(s).landmark_id == i
         }
-        removed += [self.handle(sighting) for sighting in remade]
+        removed += [self.state(sighting).handle for sighting in remade]
         made: dict[Sighting, FactorGroup] = {}
         for sighting, i in (new_of | remade).items():
             group = self.factors.make(sighting, L(i), is_first=sighting is first[i])
@@ -372,7 +372,7 @@ class LandmarkGraph:
         handles = [handle for handle in removed if handle is not None]
         changed = self.smoother.exchange(time_s, handles, list(made.values()), begun, lost)
         for sighting, handle in zip(made, changed.added, strict=True):
-            self._states[sighting].handle = handle
+            self._states[sighting] = self._states[sighting]._replace(handle=handle)
         self.follow(changed)
 
     def _first(self, landmark_id: int) -> Sighting | None:
@@ -382,18 +382,14 @@ class LandmarkGraph:
         return min(self._of.get(landmark_id, {}), key=lambda s: (s.stamp_ns, s.row), default=None)
 
     def _insert(self, sighting: Sighting, landmark_id: int, handle: int | None) -> None:
-        state = self._states[sighting]
-        state.landmark_id = landmark_id
-        state.handle = handle
+        self._states[sighting] = self.state(sighting)._replace(landmark_id=landmark_id, handle=handle)
         self._of[landmark_id][sighting] = None
 
     def _remove(self, sighting: Sighting) -> None:
-        state = self._states[sighting]
-        landmark_id = state.landmark_id
+        outcome, landmark_id, _ = self._states[sighting]
         if landmark_id is None:
             return
         del self._of[landmark_id][sighting]
         if not self._of[landmark_id] and landmark_id not in self._rooted:
             del self._of[landmark_id]
-        state.landmark_id = None
-        state.handle = None
+        self._states[sighting] = State(outcome)

@@ -212,8 +212,11 @@ class MixtureIdentities(IdentityPolicy):
 
     def landmark_of(self, each: TrackedObject) -> int | None:
         """Landmark that a tracked object counts as; None: no landmark."""
-        landmarks = map(self.landmarks.landmark_of, each.sightings)
-        return next((landmark_id for landmark_id in landmarks if landmark_id is not None), None)
+        for sighting in each.sightings:
+            landmark_id = self.landmarks.state(sighting).landmark_id
+            if landmark_id is not None:
+                return landmark_id
+        return None
 
     def _tracked(self, track: int, posterior: IdentityPosterior) -> TrackedObject:
         """Object of a track, or a new one, with its newest posterior."""
@@ -228,7 +231,7 @@ class MixtureIdentities(IdentityPolicy):
 
     def _extended(self, each: TrackedObject, sighting: Sighting, chosen: int | None) -> list[Assignment]:
         """Extend a tracked object by a sighting as chosen; what waited in its track follows."""
-        waiting = [s for s in each.sightings if self.landmarks.outcome(s) is Outcome.UNFIT]
+        waiting = [s for s in each.sightings if self.landmarks.state(s).outcome is Outcome.UNFIT]
         each.sightings.append(sighting)
         favourite = each.posterior.favourite
         self._dispute([(each, chosen)])
@@ -328,7 +331,7 @@ class MixtureIdentities(IdentityPolicy):
 
     def _choose_history(self, solved: gtsam.Values, marginals: Marginals) -> ChosenHistory:
         objects = [each for each in self.objects if not self._is_withheld(each)]
-        handles = {self.landmarks.handle(sighting) for each in objects for sighting in each.sightings}
+        handles = {self.landmarks.state(sighting).handle for each in objects for sighting in each.sightings}
         rest = self.smoother.graph_without({handle for handle in handles if handle is not None})
         values = solved
         choices = [self.landmark_of(each) for each in objects]
@@ -347,7 +350,7 @@ class MixtureIdentities(IdentityPolicy):
 
     def _is_withheld(self, each: TrackedObject) -> bool:
         """True when a sighting of an object of no landmark could not be used."""
-        outcomes = map(self.landmarks.outcome, each.sightings)
+        outcomes = [self.landmarks.state(sighting).outcome for sighting in each.sightings]
         return self.landmark_of(each) is None and Outcome.WITHHELD in outcomes
 
     def _relocated(

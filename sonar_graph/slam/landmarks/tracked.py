@@ -163,7 +163,7 @@ class TrackedIdentities(IdentityPolicy):
             if identity == track.identity:
                 continue
             for sighting in track.settled:
-                landmark_id = self.landmarks.landmark_of(sighting)
+                landmark_id = self.landmarks.state(sighting).landmark_id
                 if landmark_id is not None:
                     freed.add((landmark_id, sighting.stamp_ns))
             reopened += track.settled
@@ -236,7 +236,7 @@ class TrackedIdentities(IdentityPolicy):
                 given_up += [
                     Assignment(s, why)
                     for s in track.waiting
-                    if s in old and self.landmarks.outcome(s) is Outcome.WAITING
+                    if s in old and self.landmarks.state(s).outcome is Outcome.WAITING
                 ]
                 track.waiting = [sighting for sighting in track.waiting if sighting not in old]
             if left:
@@ -258,13 +258,13 @@ class TrackedIdentities(IdentityPolicy):
 
     def _waiting(self, sighting: Sighting) -> Assignment:
         """Let a sighting wait; one in the graph is retracted."""
-        is_in_graph = self.landmarks.landmark_of(sighting) is not None
+        is_in_graph = self.landmarks.state(sighting).landmark_id is not None
         return Assignment(sighting, Outcome.TAKEN_BACK if is_in_graph else Outcome.WAITING)
 
     def _is_displaced_from(self, sighting: Sighting, track: Track, freed: set[tuple[int, int]]) -> bool:
         """True when its frame showed the landmark of its track elsewhere, and no longer does."""
         is_free = (track.identity, sighting.stamp_ns) in freed
-        return is_free and self.landmarks.outcome(sighting) is Outcome.REPEATED
+        return is_free and self.landmarks.state(sighting).outcome is Outcome.REPEATED
 
     def _associate(self, track: Track, taken_ns: set[int]) -> list[Assignment]:
         """Judge the waiting sightings of a track; frames that show its landmark already are taken.
@@ -278,7 +278,7 @@ class TrackedIdentities(IdentityPolicy):
                 free.append(sighting)
         outcomes = dict.fromkeys(track.waiting, Outcome.REPEATED)
         for sighting, is_inside in zip(free, self._pass_gate(free, L(track.identity)), strict=True):
-            is_retracted = self.landmarks.outcome(sighting) is Outcome.TAKEN_BACK
+            is_retracted = self.landmarks.state(sighting).outcome is Outcome.TAKEN_BACK
             used = Outcome.MOVED if is_retracted else Outcome.USED_LATER
             outcomes[sighting] = used if is_inside else Outcome.GATED
         track.settled += track.waiting
