@@ -88,6 +88,7 @@ def start_prior(pose_key: int, calibration: Calibration) -> gtsam.NonlinearFacto
     """Prior of the first keyframe; position sigmas are along the world's axes, rotation sigmas about the body's."""
     start = calibration.start
     body_R_world = start.pose().rotation().matrix().T
+    # GTSAM's perturbation of a pose is in its own axes
     cov = np.zeros((6, 6))
     cov[:3, :3] = np.diag(np.square(start.rpy_sigma_rad))
     cov[3:, 3:] = body_R_world @ np.diag(np.square(start.position_sigma_m)) @ body_R_world.T
@@ -135,6 +136,7 @@ def landmark_sighting(
     range_m = float(z[0])
     range_sigma_m = math.sqrt(cov[0, 0])
     azimuth_sigma_rad = math.sqrt(cov[1, 1])
+    # apart, an outlier in one of them leaves the other its weight
     is_correlated = abs(cov[0, 1]) >= CORRELATION_LIMIT * range_sigma_m * azimuth_sigma_rad
     sigmas = np.array([azimuth_sigma_rad, elevation_sigma_rad or UNINFORMATIVE_RAD])
     if is_correlated:
@@ -173,6 +175,7 @@ def first_direction(pose_key: int, landmark_key: int, body_p_landmark: Floats) -
         In the keyframe's body frame, shape (3,), m.
     """
     range_m = float(np.linalg.norm(body_p_landmark))
+    # both components of the direction, then the range
     noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([1.0, 1.0, range_m]))
     return gtsam.BearingRangeFactor3D(pose_key, landmark_key, gtsam.Unit3(body_p_landmark), range_m, noise)
 
@@ -242,8 +245,8 @@ def heading(
             jacobians[1][0, COMPASS] = 1.0
         return np.array([wrap_angle(predicted + b[COMPASS] - yaw_rad)])
 
-    noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma_rad)
-    return gtsam.CustomFactor(robust(noise), [pose_key, bias_key], error)
+    noise = robust(gtsam.noiseModel.Isotropic.Sigma(1, sigma_rad))
+    return gtsam.CustomFactor(noise, [pose_key, bias_key], error)
 
 
 def position(

@@ -33,7 +33,6 @@ from sonar_graph.slam.landmarks import (
     MixtureIdentities,
     MixtureIdentity,
     NamelessLandmarks,
-    Screened,
     SeenFrame,
     SightingFactors,
     TrackedIdentities,
@@ -42,6 +41,9 @@ from sonar_graph.slam.landmarks import (
 from sonar_graph.slam.prediction import PredictedView, Tie
 from sonar_graph.slam.smoother import Changed
 from sonar_graph.states import DetectionLog, Outcome
+
+UNIDENTIFIED = {Outcome.NO_IDENTITY, Outcome.REPEATED}
+"""Refusals of an identity alone."""
 
 
 class Frontend:
@@ -77,12 +79,13 @@ class Frontend:
             if part is None:
                 continue
             newest = self._newest(part.stamp_ns)
-            if tie is None:
+            if tie is None:  # once a frame: all its sightings hang on one keyframe
                 motion = self._keyframes.set_for_frame(part.stamp_ns, newest.motion)
                 tie = Tie(self._keyframes.newest_key, self._keyframes.bias_keys[-1], motion)
             seen = self._predicted(policy, part, newest, tie, frozenset(taken))
             decision = policy.judge(seen)
             self._apply(decision)
+            # keyframes of sightings that wait stay in the window, so that late factors cost no restart
             self.landmarks.smoother.hold(self.policy.held())
             later = policy.reconsider()
             while not later.is_empty:
@@ -123,45 +126,49 @@ class Frontend:
         if not self._uses_tracks:
             detections = replace(detections, track=np.full(len(detections), NO_TRACK))
         stamp_ns = int(detections.stamps_ns[0])
-        is_sound = detections.are_sound()
-        refusals: list[Outcome | None] = [Outcome.UNSOUND] * len(detections)
-        is_open = np.zeros(len(detections), bool)
-        if is_sound.any():
-            screened = self._screen(detections if is_sound.all() else detections.rows(is_sound))
-            is_open[is_sound] = screened.is_open
-            for row, why in zip(np.flatnonzero(is_sound).tolist(), screened.refusals, strict=True):
-                refusals[row] = why
         ids = detections.most_probable()[0].tolist()
+        refusals = self._refusals(detections)
+        # the policy amends the rows that it decides on
         rows = [
             self.journal.record(stamp_ns, landmark_id, why or Outcome.WAITING)
             for landmark_id, why in zip(ids, refusals, strict=True)
         ]
+        # a row without an identity may get one by its track or by its place
+        may_wait = detections.track != NO_TRACK
+        if self._nameless is not None:
+            may_wait |= unnamed(detections)
+        is_open = [
+            why is None or (why in UNIDENTIFIED and waits)
+            for why, waits in zip(refusals, may_wait.tolist(), strict=True)
+        ]
         z = np.array((detections.range_m, detections.azimuth_rad)).T.copy()
         noise = detections.range_azimuth_cov
-        is_unknown = np.isnan(noise).any(axis=(1, 2))
+        is_unknown = np.isnan(noise).any(axis=(1, 2))  # then the calibration's noise holds
         if is_unknown.any():
             sonar = self._keyframes.calibration.sonar
             noise = noise.copy()
             noise[is_unknown] = np.diag([sonar.range_sigma_m**2, sonar.azimuth_sigma_rad**2])
-        return Frame(detections, stamp_ns, rows, ids, refusals, z, noise).select(is_open)
+        return Frame(detections, stamp_ns, rows, ids, refusals, z, noise).select(np.array(is_open))
 
-    def _screen(self, sound: LandmarkDetections) -> Screened:
-        """Judgement of rows without any prediction."""
-        count = len(sound)
+    def _refusals(self, detections: LandmarkDetections) -> list[Outcome | None]:
+        """Reason why a row cannot be used, or has no identity; None: it has one, or the policy chooses it by place."""
+        is_sound = detections.are_sound()
+        refusals: list[Outcome | None] = [Outcome.UNSOUND] * len(detections)
+        if not is_sound.any():
+            return refusals
+        sound = detections if is_sound.all() else detections.rows(is_sound)
         if self._keyframes.newest_ns is None:
-            return Screened([Outcome.UNLOCATED] * count, [False] * count)
-        if sound.stamps_ns[0] < self._keyframes.advanced_ns:
-            return Screened([Outcome.LATE] * count, [False] * count)
-        screened = self.policy.screen(sound)
-        if self._nameless is None:
-            return screened
-        self._nameless.refuse_taken_ids(sound)
-        is_nameless = unnamed(sound).tolist()
-        is_open = [
-            known or (nameless and why is Outcome.NO_IDENTITY)
-            for known, nameless, why in zip(screened.is_open, is_nameless, screened.refusals, strict=True)
-        ]
-        return Screened(screened.refusals, is_open)
+            screened: list[Outcome | None] = [Outcome.UNLOCATED] * len(sound)
+        elif detections.stamps_ns[0] < self._keyframes.advanced_ns:
+            # the motion to a frame before the newest instant is no longer kept
+            screened = [Outcome.LATE] * len(sound)
+        else:
+            if self._nameless is not None:
+                self._nameless.refuse_taken_ids(sound)
+            screened = self.policy.screen(sound)
+        for row, why in zip(np.flatnonzero(is_sound).tolist(), screened, strict=True):
+            refusals[row] = why
+        return refusals
 
     def _shared(self, frame: Frame) -> list[tuple[IdentityPolicy, Frame | None]]:
         """Policies in the order in which they decide, with the detections of each."""

@@ -78,12 +78,13 @@ class PredictedView:
     def __init__(
         self, tie: Tie, world_T_keyframe: gtsam.Pose3, body_T_sonar: gtsam.Pose3, covariance: JointCovariance
     ) -> None:
-        keyframe_T_sonar = tie.motion.i_T_j.compose(body_T_sonar)
+        motion = tie.motion
+        keyframe_T_sonar = motion.i_T_j.compose(body_T_sonar)
         self.world_T_sonar = world_T_keyframe.compose(keyframe_T_sonar)
         """Pose of the sonar at the frame."""
         self._world_T_keyframe = world_T_keyframe
         self._covariance = covariance
-        self._motion = tie.motion
+        self._motion = motion
         self._pose_row = covariance.rows[tie.pose_key]
         self._by_body = body_T_sonar.inverse().AdjointMap()
         """Derivative of the sonar's pose by the body's, both at the frame, shape (6, 6)."""
@@ -92,7 +93,8 @@ class PredictedView:
         self._by_state[:, self._pose_row : self._pose_row + 6] = keyframe_T_sonar.inverse().AdjointMap()
         if tie.bias_key is not None:
             row = covariance.rows[tie.bias_key]
-            self._by_state[:, row : row + len(tie.motion.bias)] = self._by_body @ tie.motion.D_bias
+            # the biases bend the motion, whose perturbation is that of the body at the frame
+            self._by_state[:, row : row + len(motion.bias)] = self._by_body @ motion.D_bias
 
     def height_variance(self, point: Floats) -> float:
         """Variance of the world z of a point fixed to the body at the frame, shape (3,) in the world, m².
@@ -101,9 +103,10 @@ class PredictedView:
         """
         row = self._pose_row
         P = self._covariance.matrix[row : row + 6, row : row + 6]
+        Q = self._motion.covariance
         by_keyframe = _height_derivative(self._world_T_keyframe, point)
         by_body = _height_derivative(self._world_T_keyframe.compose(self._motion.i_T_j), point)
-        return float(by_keyframe @ P @ by_keyframe + by_body @ self._motion.covariance @ by_body)
+        return float(by_keyframe @ P @ by_keyframe + by_body @ Q @ by_body)
 
     def expect(self, keys: list[int], points: Floats) -> tuple[Floats, Floats]:
         """Expected range and azimuth of landmarks at points of the world, shape (m, 3).
@@ -113,7 +116,8 @@ class PredictedView:
         Range (m) and azimuth (rad), shape (m, 2), and their covariances, shape (m, 2, 2).
         """
         predicted, joint = self.expect_jointly(keys, points, [])
-        return predicted, np.einsum("kikj->kij", joint.reshape(len(keys), 2, len(keys), 2))
+        m = len(keys)
+        return predicted, np.einsum("kikj->kij", joint.reshape(m, 2, m, 2))  # blocks on the diagonal
 
     def expect_jointly(self, keys: list[int], points: Floats, sources: list[Source]) -> tuple[Floats, Floats]:
         """Joint expectation of landmarks of the graph, shape (m, 3), and of points that are not in it.
@@ -139,6 +143,7 @@ class PredictedView:
         H_M = (by_sonar @ self._by_body).reshape(2 * n, 6)
         joint = H @ P @ H.T + H_M @ Q @ H_M.T
         for k, source in enumerate(sources, start=len(keys)):
+            # own noise of the point, independent of all variables of the graph
             joint[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += by_point[k] @ source.cov @ by_point[k].T
         return predicted, np.asarray(0.5 * (joint + joint.T))
 
@@ -152,8 +157,9 @@ class PredictedView:
 
         Only the variances grow. The motion also correlates range and azimuth a little, which is left out.
         """
-        H_M = view_points(self.world_T_sonar, points).by_sonar @ self._by_body
-        return cov + IDENTITY * (H_M @ motion.covariance * H_M).sum(axis=2)[:, None]
+        H_M = view_points(self.world_T_sonar, points).by_sonar @ self._by_body  # (m, 2, 6)
+        variances = (H_M @ motion.covariance * H_M).sum(axis=2)  # diagonals of H_M Q H_M'
+        return cov + IDENTITY * variances[:, None]
 
 
 def weigh(z: Floats, expected: Floats, prior_cov: Floats, cov: Floats) -> Comparison:
@@ -163,6 +169,7 @@ def weigh(z: Floats, expected: Floats, prior_cov: Floats, cov: Floats) -> Compar
     S = prior_cov + cov
     r, alpha = innovation.T
     a, b, _, c = S.reshape(-1, 4).T
+    # e' S^-1 e with the closed inverse of a 2 x 2 matrix
     distance = (c * r**2 - 2.0 * b * r * alpha + a * alpha**2) / (a * c - b**2)
     gain = np.maximum(prior_cov[:, 0, 0] / cov[:, 0, 0], prior_cov[:, 1, 1] / cov[:, 1, 1])
     return Comparison(innovation, S, distance, gain)

@@ -108,6 +108,7 @@ class SightingStack:
     def linear_factors(self, values: gtsam.Values) -> list[gtsam.JacobianFactor]:
         """Each factor, linearised, with the weight of its kernel."""
         view = self._views(values)
+        # a robust kernel multiplies rows and residuals by the root of its weight
         root = np.ones((len(view.e), 1))
         weights = [kernel.weight(d) for kernel, d in zip(self._kernels, view.lengths, strict=True)]
         root[self._robust, 0] = np.sqrt(weights)
@@ -130,6 +131,7 @@ class SightingStack:
         world_p_sonar = poses[:, 9:] + times(R, self._body_p_sonar)
         points = np.array([values.atPoint3(key) for key in self._landmark_keys])[self._landmark_of]
         q = times(world_R_sonar.transpose(0, 2, 1), points - world_p_sonar)
+        # the same model as `view_points`, for sonars of different poses
         predicted, D_q = project_points(np.ascontiguousarray(q))
         e = predicted - self._z
         e[:, 1] = wrap_angle(e[:, 1])

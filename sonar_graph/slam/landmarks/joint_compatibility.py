@@ -48,13 +48,14 @@ class Innovations:
 
     def of(self, landmarks: tuple[int, ...]) -> tuple[Floats, Floats]:
         """Innovation of the pairs of a hypothesis and its covariance, shapes (2 k,) and (2 k, 2 k)."""
-        paired = [(i, j) for i, j in enumerate(landmarks) if j != UNPAIRED]
-        rows = np.array([2 * j + axis for _, j in paired for axis in (0, 1)], dtype=np.int64)
-        e = np.array([self.innovation[i, j] for i, j in paired]).reshape(-1)
-        C = self.expected_cov[np.ix_(rows, rows)].copy()
-        for k, (i, _) in enumerate(paired):
-            C[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += self.noise[i]
-        return e, C
+        i = np.flatnonzero(np.array(landmarks) != UNPAIRED)  # detections, (k,)
+        j = np.array(landmarks)[i]  # their landmarks
+        rows = (2 * j[:, None] + [0, 1]).ravel()
+        C = self.expected_cov[np.ix_(rows, rows)]
+        # noise of different detections is independent: blocks on the diagonal
+        for k, detection in enumerate(i.tolist()):
+            C[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += self.noise[detection]
+        return self.innovation[i, j].ravel(), C
 
     def pairing(self, landmarks: tuple[int, ...]) -> Pairing:
         """Pairing of these landmarks with its D²."""

@@ -99,15 +99,6 @@ class Decision:
 UNCHANGED = Decision()
 
 
-class Screened(NamedTuple):
-    """Judgement of a frame's rows without any prediction."""
-
-    refusals: list[Outcome | None]
-    """Reason why the identity of a row is not accepted; None: it is, or the policy chooses one by place."""
-    is_open: list[bool]
-    """True: the row becomes a sighting. Without an identity, the sighting may get one later."""
-
-
 class IdentityPolicy:
     """Decides of which landmarks sightings are.
 
@@ -121,8 +112,8 @@ class IdentityPolicy:
         self.landmarks = landmarks
         self.smoother = landmarks.smoother
 
-    def screen(self, frame: LandmarkDetections) -> Screened:
-        """Judge rows by their identities and tracks alone."""
+    def screen(self, frame: LandmarkDetections) -> list[Outcome | None]:
+        """Refuse rows by their identities and tracks alone; None: the row stays."""
         raise NotImplementedError
 
     def retract(self, frame: Frame | None) -> Decision:  # noqa: ARG002
@@ -189,6 +180,7 @@ class AmendableJournal(DetectionJournal):
         self._outcomes[row] = OUTCOME_NUMBERS[changed.outcome]
         if changed.landmark_id is not None:
             self._ids[row] = changed.landmark_id
+        # an innovation was against the landmark of the earlier outcome
         e = UNKNOWN[:2] if changed.innovation is None else changed.innovation.tolist()
         S = UNKNOWN if changed.S is None else changed.S.ravel().tolist()
         self._innovations[2 * row : 2 * row + 2] = array("d", e)
@@ -310,6 +302,7 @@ class LandmarkGraph:
             self._states[sighting] = State(Outcome.WITHHELD)
             self.journal.amend(Assignment(sighting, Outcome.WITHHELD))
         for landmark_id, sightings in self._of.items():
+            # their factors are in a marginal now and cannot be taken out
             for sighting in [s for s in sightings if s.line.pose_key in changed.left]:
                 self._rooted.setdefault(landmark_id, sighting)
                 del sightings[sighting]
@@ -368,6 +361,7 @@ class LandmarkGraph:
             for i, s in first.items()
             if s is not None and first_before[i] is None
         }
+        # a landmark without sightings would be undetermined
         lost = [L(i) for i, s in first.items() if s is None and first_before[i] is not None]
         handles = [handle for handle in removed if handle is not None]
         changed = self.smoother.exchange(time_s, handles, list(made.values()), begun, lost)

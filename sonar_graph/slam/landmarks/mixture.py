@@ -25,6 +25,7 @@ A detection of no landmark may be anywhere in view, with the density u over rang
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
@@ -74,10 +75,12 @@ class IdentityPosterior:
     @classmethod
     def of(cls, frame: LandmarkDetections, row: int) -> IdentityPosterior:
         """Posterior of a row; NaN counts as 0, and a sum above 1 is normalised to 1."""
-        posterior: dict[int, float] = {}
-        for landmark_id, p in zip(frame.candidate_ids[row].tolist(), frame.id_probability[row].tolist(), strict=True):
-            if landmark_id >= 0 and p > 0:
-                posterior[landmark_id] = posterior.get(landmark_id, 0.0) + p
+        posterior: dict[int, float] = defaultdict(float)
+        candidates = frame.candidate_ids[row].tolist()
+        probabilities = frame.id_probability[row].tolist()
+        for landmark_id, p in zip(candidates, probabilities, strict=True):
+            if landmark_id >= 0 and p > 0:  # False for NaN
+                posterior[landmark_id] += p
         total = max(sum(posterior.values()), 1.0)
         return cls({landmark_id: p / total for landmark_id, p in posterior.items()})
 
@@ -90,9 +93,11 @@ class IdentityPosterior:
         """Logarithms of w for K landmarks and for none, shape (K + 1,)."""
         q = errors.wrong_id_probability
         p = np.array([self.probability.get(landmark_id, 0.0) for landmark_id in ids])
-        share = 0.5 * q / max(len(ids), LEAST_LANDMARKS)
-        none = (1.0 - q) * (1.0 - min(sum(self.probability.values()), 1.0)) + 0.5 * q
-        return np.asarray(np.log(np.append((1.0 - q) * p + share, none)))
+        missing = 1.0 - min(sum(self.probability.values()), 1.0)
+        # half of the errors are of another landmark, each as probable as the next, half of none
+        w = (1.0 - q) * p + 0.5 * q / max(len(ids), LEAST_LANDMARKS)
+        w_none = (1.0 - q) * missing + 0.5 * q
+        return np.asarray(np.log(np.append(w, w_none)))
 
 
 @dataclass(eq=False)
@@ -131,7 +136,8 @@ class Errors:
 
     def of(self, points: Floats) -> Floats:
         """Against landmarks at points of the world, shape (K, 3): range and azimuth, shape (n, K, 2)."""
-        q = np.einsum("nji,nkj->nki", self._world_R_sonar, points[None] - self._world_p_sonar[:, None])
+        from_sonar = points[None] - self._world_p_sonar[:, None]
+        q = np.einsum("nji,nkj->nki", self._world_R_sonar, from_sonar)  # R^T (p - t), in sonar axes
         expected, _ = project_points(q.reshape(-1, 3))
         e = expected.reshape(*q.shape[:2], 2) - self._z[:, None]
         e[..., 1] = wrap_angle(e[..., 1])
@@ -152,17 +158,20 @@ class Mixture:
         e[:, 1] = wrap_angle(e[:, 1])
         whitener = np.linalg.inv(np.linalg.cholesky(S))
         losses = self._kernel.loss(np.einsum("kij,kj->ki", whitener, e)).sum(axis=1)
+        half_log_det = 0.5 * np.linalg.slogdet(S)[1]
         new = [i for i in posterior.probability if i not in set(ids)]
         totals = posterior.log_weights(ids + new, self._errors)
-        totals[: len(ids)] += self._log_peak - 0.5 * np.linalg.slogdet(S)[1] - losses
+        totals[: len(ids)] += self._log_peak - half_log_det - losses
+        # a landmark that is not in the graph may be anywhere in view, as may what is none
         totals[len(ids) :] += self._errors.log_density
         return dict(zip([*ids, *new, None], totals.tolist(), strict=True))
 
     def gains(self, landmark_id: int, objects: list[TrackedObject], points: Floats, values: gtsam.Values) -> Floats:
         """Log density l_i of a landmark at each of k points minus l_none, for n tracked objects, shape (n, k)."""
-        fits = self._fits(objects, points, values)
         log_weights = np.array([each.posterior.log_weights([landmark_id], self._errors) for each in objects])
-        return np.asarray(fits - self._unplaced(objects)[:, None] + (log_weights[:, 0] - log_weights[:, 1])[:, None])
+        log_odds = log_weights[:, 0] - log_weights[:, 1]
+        unplaced = self._unplaced(objects)
+        return self._fits(objects, points, values) - unplaced[:, None] + log_odds[:, None]
 
     def scores(
         self, objects: list[TrackedObject], values: gtsam.Values, choices: Choices, sizes: dict[int, int]
@@ -182,12 +191,14 @@ class Mixture:
         ids = sorted(sizes)
         points = np.array([values.atPoint3(L(i)) for i in ids]).reshape(-1, 3)
         fits = self._fits(objects, points, values)  # (n, K)
+        unplaced = self._unplaced(objects).tolist()
         scores = []
-        for each, choice, fit, unplaced in zip(objects, choices, fits, self._unplaced(objects).tolist(), strict=True):
+        for k, each in enumerate(objects):
+            choice = choices[k]
             if choice is not None and sizes[choice] == len(each.sightings):
-                fit[ids.index(choice)] = unplaced
+                fits[k, ids.index(choice)] = unplaced[k]
             new = [i for i in each.posterior.probability if i not in sizes]
-            totals = np.append(fit, np.full(len(new) + 1, unplaced))
+            totals = np.append(fits[k], [unplaced[k]] * (len(new) + 1))
             totals += each.posterior.log_weights([*ids, *new], self._errors)
             scores.append(dict(zip([*ids, *new, None], totals.tolist(), strict=True)))
         return scores
@@ -202,8 +213,10 @@ class Mixture:
         """
         if not objects:
             return []
-        best = each_once(self.scores(objects, values, choices, sizes), [each.stamps_ns for each in objects])
+        scores = self.scores(objects, values, choices, sizes)
+        best = each_once(scores, [each.stamps_ns for each in objects])
         beginning: dict[int | None, int] = {}
+        """Object with which each new landmark begins."""
         for k in sorted(range(len(objects)), key=lambda k: -len(objects[k].sightings)):
             if best[k] is not None and best[k] not in sizes:
                 beginning.setdefault(best[k], k)
@@ -216,18 +229,21 @@ class Mixture:
         thing that stands still. If each could be anywhere, many sightings of an unknown object would prove it to be the
         nearest landmark.
         """
-        u = self._errors.log_density
+        log_u = self._errors.log_density
         totals = []
         for each in objects:
-            noise = np.array([sighting.noise for sighting in each.sightings])
-            peaks = self._log_peak - 0.5 * np.linalg.slogdet(noise)[1]
-            totals.append(u + np.maximum(peaks[1:] - REPEATED_LOSS, u).sum())
+            R = np.array([sighting.noise for sighting in each.sightings])
+            peaks = self._log_peak - 0.5 * np.linalg.slogdet(R)[1]
+            repeated = np.maximum(peaks[1:] - REPEATED_LOSS, log_u)
+            totals.append(log_u + repeated.sum())
         return np.array(totals)
 
     def _fits(self, objects: list[TrackedObject], points: Floats, values: gtsam.Values) -> Floats:
         """Log densities of tracked objects, for landmarks at points of the world, shape (n, k)."""
         errors = Errors([sighting for each in objects for sighting in each.sightings], values)
-        single = self._log_peak - errors.half_log_det[:, None] - self._kernel.loss(errors.of(points)).sum(axis=2)
+        losses = self._kernel.loss(errors.of(points)).sum(axis=2)
+        single = self._log_peak - errors.half_log_det[:, None] - losses  # (sightings, k)
+        # sum over the sightings of each object, which follow each other
         starts = list(accumulate((len(each.sightings) for each in objects[:-1]), initial=0))
         return np.asarray(np.add.reduceat(single, starts, axis=0))
 
@@ -235,13 +251,14 @@ class Mixture:
 def each_once(scores: list[Scores], stamps_ns: list[set[int]]) -> Choices:
     """Best component of each object, those with the highest density first; a landmark is once in a frame."""
     chosen: Choices = [None] * len(scores)
-    taken: dict[int, set[int]] = {}
+    taken_ns: dict[int, set[int]] = defaultdict(set)
+    """Stamps of the frames that show each landmark."""
     for row in sorted(range(len(scores)), key=lambda row: -max(scores[row].values())):
         for landmark_id in sorted(scores[row], key=scores[row].__getitem__, reverse=True):
             if landmark_id is None:
                 break
-            if taken.setdefault(landmark_id, set()).isdisjoint(stamps_ns[row]):
-                taken[landmark_id] |= stamps_ns[row]
+            if taken_ns[landmark_id].isdisjoint(stamps_ns[row]):
+                taken_ns[landmark_id] |= stamps_ns[row]
                 chosen[row] = landmark_id
                 break
     return chosen

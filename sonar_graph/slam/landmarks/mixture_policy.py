@@ -28,7 +28,6 @@ from sonar_graph.slam.landmarks.landmark_graph import (
     Decision,
     IdentityPolicy,
     LandmarkGraph,
-    Screened,
 )
 from sonar_graph.slam.landmarks.mixture import (
     Choices,
@@ -117,10 +116,9 @@ class MixtureIdentities(IdentityPolicy):
         """Solution from which the history was chosen, and number of sightings then."""
         self._history: ChosenHistory | None = None
 
-    def screen(self, frame: LandmarkDetections) -> Screened:
+    def screen(self, frame: LandmarkDetections) -> list[Outcome | None]:
         """Refuse second rows of tracks."""
-        refusals = second_rows_of_tracks(frame, {})
-        return Screened(refusals, [why is None for why in refusals])
+        return second_rows_of_tracks(frame, {})
 
     def rivals(self, frame: Frame, world_T_sonar: gtsam.Pose3) -> list[int]:
         """Landmarks of the graph, of a large map those near a detection or named; see `MOST_RIVALS`."""
@@ -148,11 +146,12 @@ class MixtureIdentities(IdentityPolicy):
         ids = [gtsam.Symbol(key).index() for key in seen.keys]
         points = np.array([self.smoother.values.atPoint3(key) for key in seen.keys]).reshape(-1, 3)
         expected, S_0 = seen.view.expect(seen.keys, points)
+        # all components of each detection, before the state is conditioned on it
         scores: list[Scores] = []
         for row in rows:
             known = self._tracks.get(tracks[row])
             landmark_id = None if known is None else self.landmark_of(known)
-            if landmark_id is not None:
+            if landmark_id is not None:  # a track is of one landmark
                 scores.append({landmark_id: np.inf})
             else:
                 S = S_0 + frame.noise[row]
@@ -240,6 +239,7 @@ class MixtureIdentities(IdentityPolicy):
         outcome = Outcome.USED if chosen == favourite else Outcome.REASSIGNED
         if chosen not in self.landmarks:
             outcome = Outcome.NEW
+        # a landmark is once in a frame
         taken_ns = self.landmarks.stamps_ns(chosen) | {sighting.stamp_ns}
         free = [s for s in waiting if s.stamp_ns not in taken_ns]
         return [Assignment(sighting, outcome, chosen), *(_late(s, each, chosen) for s in free)]
@@ -272,7 +272,9 @@ class MixtureIdentities(IdentityPolicy):
         if supporters is None:
             return UNCHANGED
         leaving = _assigned([(each, None) for each in self.objects if self.landmark_of(each) == landmark_id])
-        return Decision((tuple(leaving), tuple(_assigned([(each, landmark_id) for each in supporters]))))
+        coming = _assigned([(each, landmark_id) for each in supporters])
+        # in two rounds: a landmark begins in a new place only after it has lost its last sighting
+        return Decision((tuple(leaving), tuple(coming)))
 
     def _revisable(self) -> list[TrackedObject]:
         """Objects whose choices are revised: tracks whose posterior contradicts it, and objects in the window.
@@ -336,6 +338,7 @@ class MixtureIdentities(IdentityPolicy):
         values = solved
         choices = [self.landmark_of(each) for each in objects]
         for _ in range(MOST_HISTORY_ROUNDS):
+            # first the choices at the solution; when they are stable, the places of landmarks
             start = values
             better = self.mixture.best(objects, values, choices, _sizes(objects, choices))
             if better == choices:
@@ -397,6 +400,7 @@ class MixtureIdentities(IdentityPolicy):
             if choice is not None:
                 of[choice] += each.sightings
         for landmark_id, sightings in of.items():
+            # as in `LandmarkGraph`, the earliest has the factors that a landmark has once
             for k, sighting in enumerate(sorted(sightings, key=_age)):
                 for factor in self.landmarks.factors.make(sighting, L(landmark_id), is_first=k == 0).values():
                     graph.add(factor)

@@ -67,6 +67,7 @@ class SightingFactors:
             )
         }
         if is_first:
+            # in the keyframe's body frame
             body_p_landmark = locate(line.body_T_sonar, line.z[0], line.z[1], sighting.elevation_rad)
             made["first direction"] = factors.first_direction(line.pose_key, key, body_p_landmark)
         if is_first and sighting.floor is not None:
@@ -158,6 +159,7 @@ class SeenFrame:
             return []
         frame = self.frame
         keyframe_T_sonar = self.tie.motion.i_T_j.compose(self.factors.body_T_sonar)
+        # from here on the sonar hangs on the keyframe without error: the motion's error becomes noise
         noise = self.view.blurred(frame.noise[rows], self.tie.motion, points)
         return [
             Sighting(

@@ -28,7 +28,6 @@ from sonar_graph.slam.landmarks.landmark_graph import (
     Decision,
     IdentityPolicy,
     LandmarkGraph,
-    Screened,
 )
 from sonar_graph.slam.landmarks.sighting import Frame, SeenFrame, Sighting, late_view
 from sonar_graph.slam.landmarks.unknown import IgnoredUnknown, UnknownParams
@@ -132,18 +131,17 @@ class TrackedIdentities(IdentityPolicy):
         self._claims: list[Track] = []
         """Tracks that this frame decides or gives back their landmark, the most probable first."""
 
-    def screen(self, frame: LandmarkDetections) -> Screened:
-        """Refuse second rows of tracks. Of no track, refuse improbable identities and those that the frame repeats."""
+    def screen(self, frame: LandmarkDetections) -> list[Outcome | None]:
+        """Refuse second rows of tracks, improbable identities, and those that the frame has in a more probable row."""
         oldest_ns = int(frame.stamps_ns[0]) - self._longest_wait_ns
         known = {number: track.identity for number, track in self._tracks.items() if track.newest_ns >= oldest_ns}
         refusals = second_rows_of_tracks(frame, known)
+        # the second rows are left out before a landmark is given to the most probable row of the frame
         kept = np.array([why is None for why in refusals])
         _, outcomes = identify(frame if kept.all() else frame.rows(kept), self._minimum_probability)
         for row, number in zip(np.flatnonzero(kept).tolist(), outcomes.tolist(), strict=True):
             refusals[row] = None if number == ACCEPTED else OUTCOMES[number]
-        is_accepted = np.array([why is None for why in refusals])
-        is_open = is_accepted | (kept & (frame.track != NO_TRACK))
-        return Screened(refusals, is_open.tolist())
+        return refusals
 
     def retract(self, frame: Frame | None) -> Decision:
         """Give tracks their new identities, and let their sightings of another landmark wait again.
@@ -169,6 +167,7 @@ class TrackedIdentities(IdentityPolicy):
             reopened += track.settled
             track.reopen(track.settled)
             track.identity = identity
+        # sightings that lost their frame's landmark to one that is retracted now
         for track in self._tracks.values() if freed else ():
             displaced = [s for s in track.settled if self._is_displaced_from(s, track, freed)]
             if displaced:
@@ -211,8 +210,12 @@ class TrackedIdentities(IdentityPolicy):
         track_of = dict(zip(frame.rows, frame.detections.track.tolist(), strict=True))
         for each in judged:
             track = self._tracks.get(track_of[each.sighting.row])
-            if track is not None:
-                (track.waiting if each.outcome is Outcome.WAITING else track.settled).append(each.sighting)
+            if track is None:  # of no track: final
+                continue
+            if each.outcome is Outcome.WAITING:
+                track.waiting.append(each.sighting)
+            else:
+                track.settled.append(each.sighting)
         return Decision.of(judged)
 
     def held(self) -> dict[int, float]:
@@ -333,6 +336,7 @@ class TrackedIdentities(IdentityPolicy):
         z = frame.z[row]
         elevation_rad = seen.factors.elevation_on(seen.floor_under(row), seen.view.world_T_sonar, z)
         start = locate(seen.view.world_T_sonar, z[0], z[1], elevation_rad)
+        # as in `_compared`: of a track, the sighting must not depend on where this landmark begins
         if frame.detections.track[row] == NO_TRACK:
             (sighting,) = seen.sightings([row], start[None], elevation_rad)
         else:
@@ -343,7 +347,7 @@ class TrackedIdentities(IdentityPolicy):
 def decide(frame: LandmarkDetections, least_probability: float) -> list[int]:
     """Decision of each row: a landmark's identity, `NO_LANDMARK` or `UNDECIDED`."""
     ids, probability = frame.most_probable()
-    none = 1.0 - frame.id_probability.sum(axis=1)
+    none = 1.0 - frame.id_probability.sum(axis=1)  # the posterior of no known landmark
     decisions = np.where(none >= least_probability, NO_LANDMARK, UNDECIDED)
     is_named = (probability >= least_probability) & (ids >= 0)
     return np.where(is_named, ids, decisions).tolist()

@@ -170,11 +170,11 @@ class NamelessLandmarks(IdentityPolicy):
         judged = []
         for sighting, pair in zip(seen.sightings(rows, seen.beam_points(rows)), paired, strict=True):
             if pair.landmark_id is not None and pair.S is not None:
-                gain = float((np.diag(pair.S) / np.diag(sighting.noise)).max()) - 1.0
+                gain = float((np.diag(pair.S) / np.diag(sighting.noise)).max()) - 1.0  # S = S_0 + R
                 judged.append(Assignment(sighting, Outcome.USED, pair.landmark_id, pair.innovation, pair.S, gain))
                 continue
             candidate = pair.candidate
-            if candidate is None:
+            if candidate is None:  # neither near a landmark nor near what waits
                 candidate = []
                 self._candidates.append(candidate)
             candidate.append(sighting)
@@ -239,6 +239,7 @@ class NamelessLandmarks(IdentityPolicy):
             return paired
         expected, P = view.expect_jointly(keys, points, sources)
         n = len(ids)
+        # landmarks first; a candidate takes only what no landmark explains
         innovations = _innovations(z, noise, expected[:n], P[: 2 * n, : 2 * n])
         of_landmarks = self._choose(innovations, z)
         for i, j in of_landmarks.items():
@@ -322,6 +323,7 @@ def source(sighting: Sighting, values: gtsam.Values, factors: SightingFactors) -
     polar_cov[2, 2] = factors.elevation_sigma_rad**2
     cov = by_polar @ polar_cov @ by_polar.T
     if sighting.floor is not None:
+        # condition on p_z, a measurement of the third component
         cov = cov - np.outer(cov[:, 2], cov[2]) / (cov[2, 2] + sighting.floor.sigma_m**2)
     return Source(line.pose_key, point, by_pose, cov)
 
