@@ -142,13 +142,13 @@ def test_the_end_is_a_fixed_point_of_the_max_mixture_that_another_solver_finds()
 
 
 @pytest.mark.parametrize("kernel", [GaussianKernel(), RobustKernel()])
-def test_wrong_names_cost_nothing_and_believing_them_does(kernel: Kernel) -> None:
+def test_wrong_names_cost_nothing_and_accepting_them_does(kernel: Kernel) -> None:
     right_m = worst_landmark_m(misnamed("robust", share=0.0)[0])
     assert worst_landmark_m(misnamed("max-mixture", kernel)[0]) < right_m + 0.02
     assert worst_landmark_m(misnamed("robust")[0]) > right_m + 0.1
 
 
-def test_right_names_give_the_graph_of_one_that_believes_them() -> None:
+def test_right_names_give_the_graph_of_a_policy_that_accepts_them() -> None:
     worlds = [misnamed(policy, share=0.0)[0] for policy in ("max-mixture", "robust")]
     assert worlds[0].outcomes == worlds[1].outcomes
     for i in PLACES:
@@ -235,7 +235,7 @@ def short_lived(monkeypatch: pytest.MonkeyPatch) -> Dive:
     return Dive(CALIBRATION.model_copy(update={"floor": FLOOR}), MixtureIdentity(), lag_s=LAG_S)
 
 
-def test_all_of_the_window_is_chosen_anew_and_not_only_the_newest() -> None:
+def test_choices_of_the_whole_window_are_revised_and_not_only_the_newest() -> None:
     """Two that were perhaps of landmark 4, of which nothing was known; then one surely is."""
     world = dive("max-mixture")
     for k in (1, 2):
@@ -245,7 +245,7 @@ def test_all_of_the_window_is_chosen_anew_and_not_only_the_newest() -> None:
     assert world.outcomes == [Outcome.REASSIGNED] * 2 + [Outcome.NEW]
 
 
-def test_a_track_that_gets_another_name_is_chosen_anew_also_where_it_has_left_the_window(monkeypatch) -> None:
+def test_a_track_that_gets_another_name_is_revised_also_where_it_has_left_the_window(monkeypatch) -> None:
     """An equal one, of no track and as wrongly named, is not."""
     world = short_lived(monkeypatch)
     for k in (1, 2):
@@ -277,7 +277,7 @@ def test_keyframes_of_what_waits_are_held_and_of_what_is_known_are_not(
 
 
 def test_what_waited_in_a_frame_that_shows_the_landmark_already_is_not_of_it(monkeypatch) -> None:
-    """Before anything is chosen anew: what was surer in that frame has it."""
+    """Before choices are revised: what was surer in that frame has it."""
     monkeypatch.setattr(MixtureIdentities, "reconsider", lambda _: UNCHANGED)
     world = dive("max-mixture")
     for k in (1, 2):
@@ -293,7 +293,7 @@ def test_what_waited_in_a_frame_that_shows_the_landmark_already_is_not_of_it(mon
 
 
 def test_a_detection_of_a_known_track_gets_its_landmark_also_where_another_is_nearer(monkeypatch) -> None:
-    """Before anything is chosen anew; without a track it is of the nearer landmark."""
+    """Before choices are revised; without a track it is of the nearer landmark."""
     monkeypatch.setattr(MixtureIdentities, "reconsider", lambda _: UNCHANGED)
     world = dive("max-mixture")
     show(world, 0.3, np.vstack([at(0.3, 7), at(0.3, 9)]), [7, 9], [2, -1])
@@ -394,8 +394,8 @@ def test_the_choices_that_settle_are_the_cheapest_of_all(said: list[int]) -> Non
 
 
 @pytest.mark.parametrize("rivals", [1, 2])
-def test_far_landmarks_that_nobody_names_change_no_choice(rivals: int, monkeypatch):
-    """Of a map of more than `MOST_RIVALS` landmarks only the nearest are asked for; here of three, one or two."""
+def test_far_landmarks_that_are_not_named_change_no_choice(rivals: int, monkeypatch):
+    """Of a map of more than `MOST_RIVALS` landmarks only the nearest are compared; here of three, one or two."""
     world, settings = misnamed_world(), {"identity.policy": "max-mixture", "identity.wrong_id_probability": 0.2}
     whole = run_estimator(world, "isam2", settings)
     monkeypatch.setattr(doubtful_identities, "MOST_RIVALS", rivals)

@@ -48,7 +48,7 @@ def sighting_of(landmark_id: int, k: int, floor: FloorPrior | None, landmarks: L
 
 
 def change(landmarks: LandmarkGraph, changes: list[tuple[Sighting, int | None]]) -> None:
-    """Sightings are from now on of landmarks, or of none."""
+    """Give sightings to landmarks, or to none."""
     later = {Outcome.WAITING: Outcome.USED_LATER}
     landmarks.apply(
         [
@@ -78,7 +78,7 @@ def errors(graph: gtsam.NonlinearFactorGraph, ids: list[int], landmarks: Landmar
 @settings(max_examples=25, deadline=None)
 @given(st.lists(st.lists(st.sampled_from([7, 9, None]), min_size=POSES, max_size=POSES), min_size=1, max_size=3))
 def test_whatever_came_and_went_the_graph_is_that_of_what_is_left(floor: FloorPrior | None, stages: list) -> None:
-    """Each stage says of which landmark each sighting is from now on; the first to come is often not the earliest."""
+    """Each stage gives each sighting to a landmark or none; the first to come is often not the earliest."""
     landmarks = begun()
     seen, of = [sighting_of(7, k, floor, landmarks) for k in range(POSES)], dict[Sighting, int]()
     for stage in stages:
@@ -92,21 +92,6 @@ def test_whatever_came_and_went_the_graph_is_that_of_what_is_left(floor: FloorPr
         assert landmarks.smoother.graph.nrFactors() == expected.nrFactors()
         assert errors(landmarks.smoother.graph, ids, landmarks) == pytest.approx(errors(expected, ids, landmarks))
         assert landmarks.ids == landmarks.smoother.landmark_ids == ids
-
-
-@pytest.mark.parametrize("earliest_first", [True, False])
-def test_what_is_said_once_is_said_by_the_earliest(earliest_first: bool) -> None:
-    """Also when it comes last, and when it goes again; without a floor the elevation is of it."""
-    landmarks = begun()
-    early, middle, late = (sighting_of(7, k, None, landmarks) for k in (0, 2, 4))
-    for s in (early, middle, late) if earliest_first else (late, middle, early):
-        change(landmarks, [(s, 7)])
-    store = landmarks.smoother._store
-    counts = [len(store.factors([landmarks.state(s).handle])) for s in (early, middle, late)]
-    assert counts == [3, 2, 2]  # first_direction beside range and azimuth
-    change(landmarks, [(early, None)])
-    assert landmarks.state(early).handle is None
-    assert [len(store.factors([landmarks.state(s).handle])) for s in (middle, late)] == [3, 2]
 
 
 def test_a_landmark_whose_sightings_have_left_counts_as_one_more() -> None:
