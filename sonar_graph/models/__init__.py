@@ -8,7 +8,7 @@ identity.py    acceptance of a recogniser's identities, and the gate
 """
 
 # fmt: off
-from sonar_graph.models.aiding import HUBER_WIDTHS, Contradictions, doubted, yaw_and_derivative
+from sonar_graph.models.aiding import HUBER_WIDTHS, Contradictions, doubted, up_and_derivative, yaw_and_derivative
 from sonar_graph.models.biases import (
     ACCEL, BIASES, COMPASS, HEADING, SCALE, TILT, bias_sigmas, by_biases, gyro_bias_of,
 )
@@ -24,5 +24,5 @@ __all__ = [
     "HUBER_WIDTHS", "Kernel", "KernelParams", "MINIMUM_PROBABILITY", "Robust", "RobustKernel", "SCALE", "TILT",
     "bias_sigmas", "by_biases", "doubted", "elevation_on_floor", "gate_threshold", "gyro_bias_of", "identify",
     "locate", "locate_jacobians", "project", "project_points", "range_azimuth", "range_azimuth_jacobians",
-    "sonar_point", "sonar_point_jacobian", "view_points", "wrap_angle", "yaw_and_derivative",
+    "sonar_point", "sonar_point_jacobian", "up_and_derivative", "view_points", "wrap_angle", "yaw_and_derivative",
 ]

@@ -13,6 +13,7 @@ from collections import Counter
 import numpy as np
 
 from sonar_graph.measurements import Floats
+from sonar_graph.numerics import cross_matrix
 
 HUBER_WIDTHS = {1: 1.345, 3: 1.628}
 """k of a heading and of a fix: 95 % efficient for Gaussian noise of so many dimensions. The kernel is convex: a start
@@ -24,6 +25,12 @@ def yaw_and_derivative(R: Floats) -> tuple[float, Floats]:
     (x, a, c), (y, b, d) = R[0].tolist(), R[1].tolist()
     level2 = x * x + y * y
     return math.atan2(y, x), np.array([0.0, (y * c - x * d) / level2, (x * b - y * a) / level2])
+
+
+def up_and_derivative(R: Floats) -> tuple[Floats, Floats]:
+    """The world's up in the body, ``R^T e_z``, shape (3,), and its derivative by a turn of the body, shape (3, 3)."""
+    up = R[2]
+    return up, cross_matrix(up)
 
 
 def doubted(e: Floats, S: Floats, R: Floats) -> Floats:

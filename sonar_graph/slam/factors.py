@@ -3,18 +3,21 @@
 ::
 
     start prior ── X0 ──odometry── X1 ──odometry── X2 ── ...        X  world_T_body at a keyframe
-                   │ ╲            ╱ │                                B  gyro bias, one a stretch of time
+                   │ ╲            ╱ │                                B  biases, one a stretch of time
                    │   B0 ──walk── B1                                L  landmark in the world
                    └── range, azimuth ── L7 ── floor prior
     depth, gravity direction and the planar constraint: one keyframe each
 
-All but those that depend on biases (`biased_odometry`) or whose noises are correlated (`correlated_sighting`) are
-GTSAM's own (compiled). Range and azimuth are two: elevation stays unknown. ``RangeFactorWithTransform3D``, and for
-azimuth a camera whose optical axis lies in the
-sonar's fan plane along the measured azimuth, with the equidistant projection (Kannala and Brandt, IEEE PAMI 28(8),
-2006): a direction at angle t from the axis has an image point at distance t from its centre. Its horizontal coordinate
-is ``azimuth - measured`` at elevation 0, times ``e / tan(e)`` at a small elevation e (0.995 at 7 degrees); the vertical
-coordinate is e near the axis. So a horizontal and a vertical sigma state what is known.
+Equations and derivatives are those of `sonar_graph.models`, or of GTSAM's compiled factors. Only odometry with biases
+(`odometry_factor`) and correlated noise (`sighting_factor`) have factors of their own, gravity and heading callbacks.
+
+Range and azimuth are two factors, so that elevation stays unknown: ``RangeFactorWithTransform3D``, and a camera whose
+optical axis lies in the sonar's fan plane along the measured azimuth. The camera has the equidistant projection
+(Kannala and Brandt, IEEE PAMI 28(8), 2006): a direction at angle t from the axis has an image point at distance t from
+the centre. At a small elevation e its coordinates are::
+
+    horizontal    (azimuth - measured) e / tan(e)        e / tan(e) = 0.995 at 7 degrees
+    vertical      e                                      near the axis
 """
 
 import math
@@ -25,31 +28,43 @@ import numpy as np
 from sonar_graph.calibration import Calibration, PlanarMotion
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Floats
-from sonar_graph.models import ACCEL, BIASES, COMPASS, HUBER_WIDTHS, Robust, wrap_angle, yaw_and_derivative
-from sonar_graph.navigation import PreintegratedMotion
+from sonar_graph.models import (
+    ACCEL,
+    BIASES,
+    COMPASS,
+    HUBER_WIDTHS,
+    Robust,
+    up_and_derivative,
+    wrap_angle,
+    yaw_and_derivative,
+)
+from sonar_graph.motion import PreintegratedMotion
 from sonar_graph.numerics import cross_matrix
 from sonar_graph.slam.sighting_factor import CorrelatedSighting
 
 UNINFORMATIVE_M = 1e5
 UNINFORMATIVE_RAD = 1e3
 """Sigmas that leave a direction to the other factors."""
-EXACT, STEADY = 1e-9, 1e-3
-"""Sigma of a bias (rad/s, m/s²) that is zero; share of its sigma by which one without a walk may walk in a stretch."""
+EXACT = 1e-9
+"""Sigma of a bias (rad/s, m/s²) that is zero."""
+STEADY = 1e-3
+"""Share of its sigma by which a bias without a walk may walk in a stretch."""
 CORRELATION_LIMIT = 1e-6
 """Above it, range and azimuth noise are taken together."""
 EQUIDISTANT = gtsam.Cal3Fisheye(1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 """Unit focal lengths; no skew, offset or distortion."""
 BEAM_R_CAMERA = gtsam.Rot3(np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]))
 """Columns: image x to the left, image y up, optical axis along the beam."""
-ORIGIN, IMAGE_CENTRE, UP = np.zeros(3), np.zeros(2), np.array([0.0, 0.0, 1.0])
+ORIGIN = np.zeros(3)
+IMAGE_CENTRE = np.zeros(2)
+UP = np.array([0.0, 0.0, 1.0])
 
 
 def gaussian(cov: Floats) -> gtsam.noiseModel.Base:
-    """Noise with this covariance, all of it.
+    """Noise with this covariance, correlations included.
 
-    Left to itself GTSAM takes a matrix for diagonal when no other entry exceeds 1e-9, whatever its unit and scale:
-    motion over a short time would lose all its correlations. A matrix that is none it takes as well, and weighs by
-    numbers that are none.
+    By default GTSAM takes a matrix for diagonal when no other entry exceeds 1e-9, whatever its unit and scale: motion
+    over a short time would lose all its correlations. It also accepts NaN and indefinite matrices.
 
     Raises
     ------
@@ -58,10 +73,10 @@ def gaussian(cov: Floats) -> gtsam.noiseModel.Base:
     """
     try:
         np.linalg.cholesky(cov)
-        is_sound = bool(np.isfinite(cov).all())
+        is_positive = bool(np.isfinite(cov).all())
     except np.linalg.LinAlgError:
-        is_sound = False
-    if not is_sound:
+        is_positive = False
+    if not is_positive:
         least = np.linalg.eigvalsh(np.nan_to_num(cov))[0]
         raise MeasurementError(
             f"noise of a factor: expected a positive definite covariance, not one with an eigenvalue of {least:.3g};"
@@ -74,6 +89,7 @@ def start_prior(pose_key: int, calibration: Calibration) -> gtsam.NonlinearFacto
     """Prior of the first keyframe; position sigmas are along the world's axes, rotation sigmas about the body's."""
     start = calibration.start
     body_R_world = start.pose().rotation().matrix().T
+    # GTSAM's perturbation of a pose is in its own axes
     cov = np.zeros((6, 6))
     cov[:3, :3] = np.diag(np.square(start.rpy_sigma_rad))
     cov[3:, 3:] = body_R_world @ np.diag(np.square(start.position_sigma_m)) @ body_R_world.T
@@ -87,15 +103,14 @@ def bias_prior(bias_key: int, sigmas: Floats) -> gtsam.NonlinearFactor:
 
 
 def bias_walk(key_i: int, key_j: int, sigmas: Floats) -> gtsam.NonlinearFactor:
-    """Biases of the next stretch are those of the last, give or take a sigma each."""
+    """Biases of the next stretch differ from those of the last by N(0, sigma²), one sigma each."""
     noise = gtsam.noiseModel.Diagonal.Sigmas(np.maximum(sigmas, STEADY * EXACT), False)
     return gtsam.BetweenFactorVector(key_i, key_j, np.zeros(len(sigmas)), noise)
 
 
 def odometry(key_i: int, key_j: int, motion: PreintegratedMotion) -> gtsam.NonlinearFactor:
     """Relative pose from preintegrated gyro and DVL where the gyro has no bias to estimate."""
-    noise = gaussian(motion.covariance)
-    return gtsam.BetweenFactorPose3(key_i, key_j, motion.i_T_j, noise)
+    return gtsam.BetweenFactorPose3(key_i, key_j, motion.i_T_j, gaussian(motion.covariance))
 
 
 def landmark_sighting(
@@ -116,42 +131,29 @@ def landmark_sighting(
     z, cov
         Range (m) and azimuth (rad), shape (2,), and their covariance, shape (2, 2).
     elevation_sigma_rad
-        Elevation is N(0, sigma²); None: not said here. Say it once a landmark: its elevation does not vary between
-        frames as noise would, so that repeating it would invent information.
+        Elevation is N(0, sigma²); None: unknown. Give it once a landmark. Its elevation does not vary between frames as
+        noise would, so that repeating it would invent information.
     """
-    range_var, azimuth_var, covariance = float(cov[0, 0]), float(cov[1, 1]), float(cov[0, 1])
-    keys = pose_key, landmark_key
-    if abs(covariance) < CORRELATION_LIMIT * math.sqrt(range_var * azimuth_var):
-        noise = robust(gtsam.noiseModel.Isotropic.Sigma(1, math.sqrt(range_var)))
-        azimuth_sigma_rad = math.sqrt(azimuth_var)
-        return {
-            "azimuth": _camera(*keys, body_T_sonar, float(z[1]), azimuth_sigma_rad, elevation_sigma_rad, robust),
-            "range": gtsam.RangeFactorWithTransform3D(*keys, float(z[0]), noise, body_T_sonar),
-        }
-    both = {"range and azimuth": correlated_sighting(*keys, body_T_sonar, z, cov, robust)}
-    if not elevation_sigma_rad:
-        return both
-    elevation = _camera(*keys, body_T_sonar, float(z[1]), UNINFORMATIVE_RAD, elevation_sigma_rad, robust)
-    return {"elevation": elevation, **both}
-
-
-def _camera(
-    pose_key: int,
-    landmark_key: int,
-    body_T_sonar: gtsam.Pose3,
-    azimuth_rad: float,
-    azimuth_sigma_rad: float,
-    elevation_sigma_rad: float | None,
-    robust: Robust,
-) -> gtsam.NoiseModelFactor:
-    """Azimuth and elevation of a landmark about a direction at elevation 0; without a sigma elevation is not said."""
-    sonar_R_camera = gtsam.Rot3.Rz(azimuth_rad).compose(BEAM_R_CAMERA)
+    range_m = float(z[0])
+    range_sigma_m = math.sqrt(cov[0, 0])
+    azimuth_sigma_rad = math.sqrt(cov[1, 1])
+    # apart, an outlier in one of them leaves the other its weight
+    is_correlated = abs(cov[0, 1]) >= CORRELATION_LIMIT * range_sigma_m * azimuth_sigma_rad
+    sigmas = np.array([azimuth_sigma_rad, elevation_sigma_rad or UNINFORMATIVE_RAD])
+    if is_correlated:
+        sigmas[0] = UNINFORMATIVE_RAD  # the azimuth is in the factor with the range
+    sonar_R_camera = gtsam.Rot3.Rz(float(z[1])).compose(BEAM_R_CAMERA)
     body_T_camera = body_T_sonar.compose(gtsam.Pose3(sonar_R_camera, ORIGIN))
-    vertical = UNINFORMATIVE_RAD if elevation_sigma_rad is None else elevation_sigma_rad
-    noise = robust(gtsam.noiseModel.Diagonal.Sigmas(np.array([azimuth_sigma_rad, vertical])))
-    return gtsam.GenericProjectionFactorCal3Fisheye(
+    noise = robust(gtsam.noiseModel.Diagonal.Sigmas(sigmas))
+    camera = gtsam.GenericProjectionFactorCal3Fisheye(
         IMAGE_CENTRE, noise, pose_key, landmark_key, EQUIDISTANT, False, False, body_T_camera
     )
+    if not is_correlated:
+        noise = robust(gtsam.noiseModel.Isotropic.Sigma(1, range_sigma_m))
+        distance = gtsam.RangeFactorWithTransform3D(pose_key, landmark_key, range_m, noise, body_T_sonar)
+        return {"azimuth": camera, "range": distance}
+    both = correlated_sighting(pose_key, landmark_key, body_T_sonar, z, cov, robust)
+    return {"elevation": camera, "range and azimuth": both} if elevation_sigma_rad else {"range and azimuth": both}
 
 
 def correlated_sighting(
@@ -162,11 +164,11 @@ def correlated_sighting(
 
 
 def first_direction(pose_key: int, landmark_key: int, body_p_landmark: Floats) -> gtsam.NonlinearFactor:
-    """A landmark is somewhere about where it was first seen: direction to a radian, range to its whole length.
+    """A landmark is roughly where it was first seen: direction to a radian, range to its whole length.
 
-    Beside a sonar's noise that says nothing. But the azimuth factor is blind to what lies behind it, and where a wrong
-    identity contradicts a right one a solution may lie behind both: without this factor nothing but two ranges would
-    then hold the landmark, and the system would have no solution.
+    Beside a sonar's noise that is no information. But the azimuth factor has no gradient behind the sonar. Where a
+    wrong identity contradicts a right one, a solution may lie behind both: without this factor only two ranges would
+    then constrain the landmark, and the system would be singular.
 
     Parameters
     ----------
@@ -174,6 +176,7 @@ def first_direction(pose_key: int, landmark_key: int, body_p_landmark: Floats) -
         In the keyframe's body frame, shape (3,), m.
     """
     range_m = float(np.linalg.norm(body_p_landmark))
+    # both components of the direction, then the range
     noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([1.0, 1.0, range_m]))
     return gtsam.BearingRangeFactor3D(pose_key, landmark_key, gtsam.Unit3(body_p_landmark), range_m, noise)
 
@@ -191,11 +194,11 @@ def depth(pose_key: int, z_m: float, body_p_port: Floats, sigma_m: float) -> gts
 
 
 def gravity_direction(pose_key: int, up_in_body: Floats, sigma_rad: float) -> gtsam.NonlinearFactor:
-    """World's up, seen in the body as ``up_in_body`` (any length), to sigma_rad about each horizontal axis.
+    """World's up, measured in the body as ``up_in_body`` (any length), to sigma_rad about each horizontal axis.
 
-    ``R^T e_z - up``, GTSAM's factor for a magnetometer without bias, and not its attitude factor: that one compares the
-    two directions in the world, where a turn about the vertical turns the residual. Linearised, it says of the yaw what
-    it cannot know: the more the larger its residual is beside sigma.
+    ``R^T e_z - up``, GTSAM's factor for a magnetometer without bias. GTSAM's attitude factor compares the two
+    directions in the world, where a turn about the vertical turns the residual. Its linearisation adds false yaw
+    information, which grows with the residual.
     """
     measured = up_in_body / np.linalg.norm(up_in_body)
     noise = gtsam.noiseModel.Isotropic.Sigma(3, sigma_rad)
@@ -210,16 +213,16 @@ def gravity_with_bias(
     ``by_accel``: A, derivative of the unit vector measured by the bias, shape (3, 3), s²/m.
     """
     measured = up_in_body / np.linalg.norm(up_in_body)
-    across, by_bias = by_accel - np.outer(measured, measured @ by_accel), np.zeros((3, BIASES))
-    by_bias[:, ACCEL] = across
+    A = by_accel - np.outer(measured, measured @ by_accel)  # a unit vector only changes across itself
+    by_bias = np.zeros((3, BIASES))
+    by_bias[:, ACCEL] = A
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:
-        up = values.atPose3(pose_key).matrix()[2, :3]
+        up, by_turn = up_and_derivative(values.atPose3(pose_key).rotation().matrix())
         if jacobians is not None:
-            by_pose = np.zeros((3, 6))
-            by_pose[:, :3] = cross_matrix(up)
-            jacobians[0], jacobians[1] = by_pose, by_bias
-        return up + across @ values.atVector(bias_key)[ACCEL] - measured
+            jacobians[0] = np.hstack((by_turn, np.zeros((3, 3))))
+            jacobians[1] = by_bias
+        return up + A @ values.atVector(bias_key)[ACCEL] - measured
 
     return gtsam.CustomFactor(gtsam.noiseModel.Isotropic.Sigma(3, sigma_rad), [pose_key, bias_key], error)
 
@@ -232,24 +235,25 @@ def huber(noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
 def heading(
     pose_key: int, bias_key: int, yaw_rad: float, sigma_rad: float, robust: Robust = huber
 ) -> gtsam.NoiseModelFactor:
-    """Yaw of the body and the compass' bias add up to what is measured: ``atan2(R_yx, R_xx) + b_compass - yaw``."""
+    """Measured yaw is that of the body plus the bias of the compass: ``atan2(R_yx, R_xx) + b_compass - yaw``."""
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:
         b = values.atVector(bias_key)
         predicted, by_turn = yaw_and_derivative(values.atPose3(pose_key).rotation().matrix())
         if jacobians is not None:
-            jacobians[0], jacobians[1] = np.zeros((1, 6)), np.zeros((1, len(b)))
-            jacobians[0][0, :3], jacobians[1][0, COMPASS] = by_turn, 1.0
+            jacobians[0] = np.concatenate((by_turn, np.zeros(3)))[None]
+            jacobians[1] = np.zeros((1, len(b)))
+            jacobians[1][0, COMPASS] = 1.0
         return np.array([wrap_angle(predicted + b[COMPASS] - yaw_rad)])
 
-    noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma_rad)
-    return gtsam.CustomFactor(robust(noise), [pose_key, bias_key], error)
+    noise = robust(gtsam.noiseModel.Isotropic.Sigma(1, sigma_rad))
+    return gtsam.CustomFactor(noise, [pose_key, bias_key], error)
 
 
 def position(
     pose_key: int, position_m: Floats, keyframe_p_antenna: Floats, cov_m2: Floats, robust: Robust = huber
 ) -> gtsam.NoiseModelFactor:
-    """World position of a point, shape (3,) in the keyframe's body frame, as measured: ``p + R l - z``."""
+    """World position of a point l, shape (3,) in the keyframe's body frame: ``p + R l - z``."""
     return gtsam.GPSFactorArm(pose_key, position_m, keyframe_p_antenna, robust(gaussian(cov_m2)))
 
 

@@ -1,14 +1,20 @@
-"""Detections to factors: a frame is screened, tied to a keyframe, predicted, and assigned to landmarks.
+"""Path of a detection into the graph.
 
-A frame hangs on the newest keyframe by the odometry between them: the sonar's pose at the frame, in the keyframe's
-body frame. Detections are predicted from there (docs/theory/models.md) and compared with the joint covariance of
-keyframe, gyro bias and landmarks. The identity policy decides which become factors (docs/theory/identities.md,
-doubtful_identities.md, unknown_landmarks.md), and may change its mind; the landmark graph does what it decides.
+For each frame (`Frontend.add`)::
+
+    screen      rows that cannot be used, or have no identity          journal: one row a detection
+    revise      earlier sightings whose identity the frame changes     policy decides, `LandmarkGraph` applies
+    tie         set a keyframe if the frame needs a newer one          the frame hangs on it by odometry
+    predict     range and azimuth of rivals, with covariances          from the newest keyframe of the window
+    decide      landmark of each detection, or a refusal               policy decides, `LandmarkGraph` applies
+    reconsider  earlier sightings at the new estimate                  policy decides, `LandmarkGraph` applies
+
+Every decision is a value. It is applied, and the estimate updated if that is due, before the policy decides again
+(docs/theory/identities.md, doubtful_identities.md, unknown_landmarks.md). Predictions: docs/theory/models.md.
 """
 
 from collections.abc import Set
 from dataclasses import replace
-from itertools import compress
 
 import numpy as np
 
@@ -19,91 +25,92 @@ from sonar_graph.slam.keyframes import Keyframes
 from sonar_graph.slam.landmarks import (
     AmendableJournal,
     AssociatedUnknown,
+    Decision,
+    Frame,
     IdentityParams,
     IdentityPolicy,
     LandmarkGraph,
     MixtureIdentities,
     MixtureIdentity,
     NamelessLandmarks,
-    Screened,
     SeenFrame,
     SightingFactors,
     TrackedIdentities,
+    unnamed,
 )
+from sonar_graph.slam.prediction import PredictedView, Tie
 from sonar_graph.slam.smoother import Changed
 from sonar_graph.states import DetectionLog, Outcome
 
-NOTHING = Screened([], [])
+UNIDENTIFIED = {Outcome.NO_IDENTITY, Outcome.REPEATED}
+"""Refusals of an identity alone."""
 
 
 class Frontend:
-    """Adds the factors of detected landmarks to a smoother and records what became of each detection."""
+    """Adds the factors of detected landmarks to a smoother and records the outcome of each detection."""
 
     def __init__(self, identity: IdentityParams, kernel: KernelParams, keyframes: Keyframes) -> None:
+        calibration = keyframes.calibration
+        factors = SightingFactors(calibration.sonar, kernel.robust(), calibration.floor)
         self.journal = AmendableJournal()
-        self._keyframes = keyframes
-        factors = SightingFactors(keyframes.calibration.sonar, kernel.robust())
         self.landmarks = LandmarkGraph(keyframes.smoother, factors, self.journal)
+        self._keyframes = keyframes
         self._uses_tracks = identity.longest_wait_s > 0
         self.policy: IdentityPolicy
+        self._nameless: NamelessLandmarks | None = None
+        """Policy of rows that name no landmark; None: they are refused, or the policy decides on them too."""
         if isinstance(identity, MixtureIdentity):
             self.policy = MixtureIdentities(self.landmarks, identity, kernel)
         else:
-            unknown, nameless = identity.unknown, None
-            if isinstance(unknown, AssociatedUnknown):
-                nameless = NamelessLandmarks(self.landmarks, keyframes, unknown)
-            self.policy = TrackedIdentities(self.landmarks, identity, nameless)
+            self.policy = TrackedIdentities(self.landmarks, identity)
+            if isinstance(identity.unknown, AssociatedUnknown):
+                self._nameless = NamelessLandmarks(self.landmarks, keyframes, identity.unknown)
 
-    def add(self, frame: LandmarkDetections) -> None:
-        """Take in the detections of one frame."""
-        seen = self._screened(frame)
-        if seen is None:
+    def add(self, detections: LandmarkDetections) -> None:
+        """Decide on the detections of one frame, and on earlier ones that it concerns."""
+        frame = self._screened(detections)
+        if frame is None:
             return
-        for assignments in self.policy.assign(seen):
-            self.landmarks.apply(assignments, self._keyframes.newest_s)
-            self.update_if_due()
+        tie: Tie | None = None
+        taken: set[int] = set()
+        for policy, part in self._shared(frame):
+            self._apply(policy.retract(part))
+            self._apply(policy.associate(part))
+            if part is None:
+                continue
+            newest = self._newest(part.stamp_ns)
+            if tie is None:  # once a frame: all its sightings hang on one keyframe
+                motion = self._keyframes.set_for_frame(part.stamp_ns, newest.motion)
+                tie = Tie(self._keyframes.newest_key, self._keyframes.bias_keys[-1], motion)
+            seen = self._predicted(policy, part, newest, tie, frozenset(taken))
+            decision = policy.judge(seen)
+            self._apply(decision)
+            # keyframes of sightings that wait stay in the window, so that late factors cost no restart
+            self.landmarks.smoother.hold(self.policy.held())
+            later = policy.reconsider()
+            while not later.is_empty:
+                self._apply(later)
+                later = policy.reconsider()
+            for each in decision.assignments:
+                landmark_id = self.landmarks.state(each.sighting).landmark_id
+                if landmark_id is not None:  # it is None where the smoother withheld the sighting
+                    taken.add(landmark_id)
 
     def add_fix(self, stamp_ns: int, position_m: Floats, cov_m2: Floats) -> None:
-        """Take in a position fix, which enters the estimate at once unless it has next to nothing to tell."""
+        """Add a position fix, which enters the estimate at once if it adds enough information."""
         self._keyframes.add_fix(stamp_ns, position_m, cov_m2)
         self.update_if_due()
 
     def update_if_due(self) -> None:
-        """Bring the smoother up to date, and the sightings in line with what it withheld and gave up."""
-        if (changed := self._keyframes.update_if_due()) is not None:
+        """Update the smoother, and the states of sightings that it withheld or that left the window."""
+        changed = self._keyframes.update_if_due()
+        if changed is not None:
             self._follow(changed)
 
     def advance(self, until_ns: int) -> None:
         """Set the keyframes that are due at an instant."""
         for changed in self._keyframes.advance(until_ns):
             self._follow(changed)
-
-    def _screened(self, frame: LandmarkDetections) -> SeenFrame | None:
-        """Rows that may become sightings; all rows go to the journal."""
-        if not self._uses_tracks:
-            frame = replace(frame, track=np.full(len(frame), NO_TRACK))
-        stamp_ns, is_sound = int(frame.stamps_ns[0]), frame.are_sound()
-        refusals: list[Outcome | None] = [Outcome.UNSOUND] * len(frame)
-        waits, kept = [False] * len(frame), np.flatnonzero(is_sound).tolist()
-        if self._keyframes.newest_ns is None:
-            said = Screened([Outcome.UNLOCATED] * len(kept), [False] * len(kept))
-        elif stamp_ns < self._keyframes.advanced_ns:
-            said = Screened([Outcome.LATE] * len(kept), [False] * len(kept))
-        else:
-            said = self.policy.screen(frame if len(kept) == len(frame) else frame.rows(is_sound)) if kept else NOTHING
-        for row, why, wait in zip(kept, *said, strict=True):
-            refusals[row], waits[row] = why, wait
-        is_open = [why is None or wait for why, wait in zip(refusals, waits, strict=True)]
-        ids = frame.most_probable()[0].tolist()
-        rows = [
-            self.journal.record(stamp_ns, landmark_id, why or Outcome.WAITING)
-            for landmark_id, why in zip(ids, refusals, strict=True)
-        ]
-        if not any(is_open):
-            return None
-        seen = frame if all(is_open) else frame.rows(np.array(is_open))
-        rows, ids, refusals = (list(compress(column, is_open)) for column in (rows, ids, refusals))
-        return SeenFrame(seen, rows, ids, refusals, self._keyframes, self.landmarks.factors)
 
     def smoothed(self) -> Solution:
         """Solution of the whole graph, with the doubtful identities that fit it best."""
@@ -112,13 +119,101 @@ class Frontend:
     def log(self) -> DetectionLog:
         """Outcome of each detection in the same history."""
         self._forget(set())
-        return self.landmarks.rechosen(self.policy.rechosen()).log()
+        return self.landmarks.log(self.policy.rechosen())
+
+    def _screened(self, detections: LandmarkDetections) -> Frame | None:
+        """Detections that may become sightings. Every row enters the journal, a refused one with its reason."""
+        if not self._uses_tracks:
+            detections = replace(detections, track=np.full(len(detections), NO_TRACK))
+        stamp_ns = int(detections.stamps_ns[0])
+        ids = detections.most_probable()[0].tolist()
+        refusals = self._refusals(detections)
+        # the policy amends the rows that it decides on
+        rows = [
+            self.journal.record(stamp_ns, landmark_id, why or Outcome.WAITING)
+            for landmark_id, why in zip(ids, refusals, strict=True)
+        ]
+        # a row without an identity may get one by its track or by its place
+        may_wait = detections.track != NO_TRACK
+        if self._nameless is not None:
+            may_wait |= unnamed(detections)
+        is_open = [
+            why is None or (why in UNIDENTIFIED and waits)
+            for why, waits in zip(refusals, may_wait.tolist(), strict=True)
+        ]
+        z = np.array((detections.range_m, detections.azimuth_rad)).T.copy()
+        noise = detections.range_azimuth_cov
+        is_unknown = np.isnan(noise).any(axis=(1, 2))  # then the calibration's noise holds
+        if is_unknown.any():
+            sonar = self._keyframes.calibration.sonar
+            noise = noise.copy()
+            noise[is_unknown] = np.diag([sonar.range_sigma_m**2, sonar.azimuth_sigma_rad**2])
+        return Frame(detections, stamp_ns, rows, ids, refusals, z, noise).select(np.array(is_open))
+
+    def _refusals(self, detections: LandmarkDetections) -> list[Outcome | None]:
+        """Reason why a row cannot be used, or has no identity; None: it has one, or the policy chooses it by place."""
+        is_sound = detections.are_sound()
+        refusals: list[Outcome | None] = [Outcome.UNSOUND] * len(detections)
+        if not is_sound.any():
+            return refusals
+        sound = detections if is_sound.all() else detections.rows(is_sound)
+        if self._keyframes.newest_ns is None:
+            screened: list[Outcome | None] = [Outcome.UNLOCATED] * len(sound)
+        elif detections.stamps_ns[0] < self._keyframes.advanced_ns:
+            # the motion to a frame before the newest instant is no longer kept
+            screened = [Outcome.LATE] * len(sound)
+        else:
+            if self._nameless is not None:
+                self._nameless.refuse_taken_ids(sound)
+            screened = self.policy.screen(sound)
+        for row, why in zip(np.flatnonzero(is_sound).tolist(), screened, strict=True):
+            refusals[row] = why
+        return refusals
+
+    def _shared(self, frame: Frame) -> list[tuple[IdentityPolicy, Frame | None]]:
+        """Policies in the order in which they decide, with the detections of each."""
+        if self._nameless is None:
+            return [(self.policy, frame)]
+        is_nameless = unnamed(frame.detections)
+        return [(self.policy, frame.select(~is_nameless)), (self._nameless, frame.select(is_nameless))]
+
+    def _newest(self, stamp_ns: int) -> Tie:
+        """Instant tied to the newest keyframe."""
+        keyframes = self._keyframes
+        return Tie(keyframes.newest_key, keyframes.bias_keys[-1], keyframes.motion_since_newest(stamp_ns))
+
+    def _predicted(
+        self, policy: IdentityPolicy, frame: Frame, newest: Tie, tie: Tie, taken: frozenset[int]
+    ) -> SeenFrame:
+        """The frame with its prediction from the newest keyframe of the window.
+
+        A keyframe that was set for this frame enters the window with the next update, together with its sightings.
+        """
+        smoother = self._keyframes.smoother
+        body_T_sonar = self.landmarks.factors.body_T_sonar
+        world_T_keyframe = smoother.estimates.atPose3(newest.pose_key)
+        world_T_sonar = world_T_keyframe.compose(newest.motion.i_T_j).compose(body_T_sonar)
+        keys = policy.rivals(frame, world_T_sonar)
+        joint = smoother.joint_covariance([*newest.keys, *keys])
+        view = PredictedView(newest, world_T_keyframe, body_T_sonar, joint)
+        return SeenFrame(frame, view, keys, tie, taken, self.landmarks.factors)
+
+    def _apply(self, decision: Decision) -> None:
+        """Apply each round of a decision, and update the estimate before the next."""
+        if decision.settles:
+            self.landmarks.settle(self._keyframes.newest_s)
+        for assignments in decision.rounds:
+            self.landmarks.apply(assignments, self._keyframes.newest_s)
+            self.update_if_due()
 
     def _follow(self, changed: Changed) -> None:
         self.landmarks.follow(changed)
         if changed.left:
             self._forget(changed.left)
+            self.landmarks.forget(changed.left)
 
     def _forget(self, left: Set[int]) -> None:
-        if given_up := self.policy.forget(self._keyframes.advanced_ns, left):
-            self.landmarks.apply(given_up, self._keyframes.newest_s)
+        """Give up sightings that have waited too long, or whose keyframes have left the window."""
+        for policy in (self.policy, self._nameless):
+            if policy is not None and (given_up := policy.forget(self._keyframes.advanced_ns, left)):
+                self.landmarks.apply(given_up, self._keyframes.newest_s)

@@ -1,21 +1,28 @@
 """Odometry that depends on biases, as a factor, and all such factors of a graph at once.
 
 With ``i_T_j`` the preintegrated motion for the biases b_0, C its covariance and D its derivative by them, but for the
-turn ``psi = h (b_heading - its b_0)`` about the world's vertical u, seen in body j::
+turn ``psi = h (b - b_0)`` about the world's vertical u, seen in body j::
 
     E = (i_T_j Exp(c))^-1 X_i^-1 X_j Exp(-psi u),    c = D (b - b_0),    e = Log(E) ~ N(0, C)
     de/dX_i = -J(e) Ad(Exp(psi u) X_j^-1 X_i),    de/dX_j = J(e) [I, Exp(psi u)],    J: derivative of Log
     de/db = -J(e) (Ad(E^-1) J(c)^-1 D + [u, 0] h)
 
-About a fixed axis of the body that turn would be a tilt once the estimate tilts, and gravity tell of it. GTSAM has no
-compiled factor with these rows; `odometry_arrays` has them. A question of GTSAM's, in Python, still takes as long as
-many compiled ones, so that a solution of thousands asks for all of them together.
+About a fixed axis of the body that turn would become a tilt as soon as the estimate tilts, and gravity would constrain
+it. With ``E = (R, t)``, ``theta = Log(R)`` and V the mean of ``Exp(s theta)`` over s in [0, 1]::
+
+    Log(E) = (theta, V^-1 t),    V^-1 = I - [theta]x / 2 + a [theta]x^2
+    a = (1 - y cot y) / |theta|^2,    y = |theta| / 2
+    J = [ V^-T   0   ]     B: derivative of V^-1 t by theta
+        [ B V^-T V^-T ]
+
+GTSAM has no compiled factor with these rows. It calls Python once for each factor, which takes as long as many compiled
+ones, so that a solution of thousands evaluates them together (`OdometryStack`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import gtsam
 import numpy as np
@@ -23,36 +30,88 @@ import numpy as np
 from sonar_graph.measurements import Floats
 from sonar_graph.models import HEADING
 from sonar_graph.motion import PreintegratedMotion
+from sonar_graph.numerics import (
+    I3,
+    O3,
+    Mat3,
+    Mat6,
+    Vec3,
+    Vec6,
+    chord_inverse,
+    compiled,
+    curvature,
+    exp_and_mean,
+    inlined,
+    mat6,
+    outer,
+    rodrigues,
+    rotation_log,
+    skew,
+    vec,
+)
 from sonar_graph.slam.factors import ORIGIN, gaussian
-from sonar_graph.slam.odometry_arrays import odometry_derivatives, odometry_errors, pose_row, poses_of
+from sonar_graph.slam.sighting_factor import poses_of
 
 UNIT = gtsam.noiseModel.Unit.Create(6)
 
 
 class OdometryError:
-    """Error of one such factor, as GTSAM asks for it."""
+    """Error of one factor, called by GTSAM."""
 
-    __slots__ = ("bias_0", "keys", "law")
+    __slots__ = ("D", "bias_0", "h", "i_T_j", "keys")
 
     def __init__(self, keys: tuple[int, int, int], motion: PreintegratedMotion, up_j: Floats) -> None:
-        self.keys, self.bias_0 = keys, motion.bias
-        by_turn = np.zeros(motion.D_bias.shape[1])
-        by_turn[HEADING] = up_j @ motion.D_bias[:3, HEADING]
-        D = motion.D_bias.copy()
-        D[:3] -= np.outer(up_j, by_turn)
-        self.law = pose_row(motion.i_T_j)[None], D[None], by_turn[None], np.eye(6)[None]
+        self.keys = keys
+        self.bias_0 = motion.bias
+        self.i_T_j = pose_row(motion.i_T_j)
+        self.h = np.zeros(motion.D_bias.shape[1])
+        self.h[HEADING] = up_j @ motion.D_bias[:3, HEADING]
+        self.D = motion.D_bias.copy()
+        self.D[:3] -= np.outer(up_j, self.h)
 
     def __call__(self, _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:
         """Error, shape (6,), unwhitened."""
         i, j, bias_key = self.keys
-        poses = pose_row(values.atPose3(i))[None], pose_row(values.atPose3(j))[None]
-        at = *poses, (values.atVector(bias_key) - self.bias_0)[None], *self.law
+        X_i = pose_row(values.atPose3(i))[None]
+        X_j = pose_row(values.atPose3(j))[None]
+        change = (values.atVector(bias_key) - self.bias_0)[None]
+        motion = (self.i_T_j[None], self.D[None], self.h[None], np.eye(6)[None])
         if jacobians is None:
-            return odometry_errors(*at)[0]
-        (e,), *columns = odometry_derivatives(*at)
+            return odometry_errors(X_i, X_j, change, *motion)[0]
+        (e,), *columns = odometry_derivatives(X_i, X_j, change, *motion)
         for k, (transposed,) in enumerate(columns):
             jacobians[k] = transposed.T
         return np.asarray(e)
+
+
+class OdometryWithBias(gtsam.CustomFactor):
+    """Relative pose from preintegrated gyro and DVL, and the biases b, of which ``D_bias`` has a column each.
+
+    ``up_j``: u when the motion was set, shape (3,), along which ``D_bias`` has that turn; zero without gravity.
+    """
+
+    __slots__ = ("covariance", "law")
+    Stack: ClassVar[type[OdometryStack]]
+
+    def __init__(
+        self, key_i: int, key_j: int, bias_key: int, motion: PreintegratedMotion, up_j: Floats = ORIGIN
+    ) -> None:
+        self.law = OdometryError((key_i, key_j, bias_key), motion, up_j)
+        self.covariance = motion.covariance
+        super().__init__(gaussian(motion.covariance), [key_i, key_j, bias_key], self.law)
+
+
+class Motions(NamedTuple):
+    """Constants of n motions."""
+
+    i_T_j: Floats
+    """Rows of R, and p, shape (n, 12)."""
+    D: Floats
+    """Shape (n, 6, 11)."""
+    h: Floats
+    """Shape (n, 11)."""
+    whitening: Floats
+    """W with ``W C W^T = I``, shape (n, 6, 6)."""
 
 
 class OdometryStack:
@@ -63,45 +122,154 @@ class OdometryStack:
         self._keys = [law.keys for law in laws]
         self._pose_keys = np.array([keys[:2] for keys in self._keys], np.uint64).T
         self._bias_keys = sorted({keys[2] for keys in self._keys})
-        self._biases = np.searchsorted(self._bias_keys, [keys[2] for keys in self._keys])
+        self._bias_of = np.searchsorted(self._bias_keys, [keys[2] for keys in self._keys])
         self._bias_0 = np.array([law.bias_0 for law in laws])
-        means, Ds, turns, _ = map(np.concatenate, zip(*(law.law for law in laws), strict=True))
         covariances = np.array([factor.covariance for factor in factors])
-        self._laws = means, Ds, turns, np.linalg.inv(np.linalg.cholesky(covariances))
+        self._motions = Motions(
+            i_T_j=np.array([law.i_T_j for law in laws]),
+            D=np.array([law.D for law in laws]),
+            h=np.array([law.h for law in laws]),
+            whitening=np.linalg.inv(np.linalg.cholesky(covariances)),
+        )
 
     def error(self, values: gtsam.Values) -> float:
         """Half the sum of squared whitened errors."""
-        e = odometry_errors(*self._at(values), *self._laws)
+        e = odometry_errors(*self._states(values), *self._motions)
         return 0.5 * float(np.vdot(e, e))
 
     def linear_factors(self, values: gtsam.Values) -> list[gtsam.JacobianFactor]:
-        """What linearising each of them gives."""
-        e, *columns = odometry_derivatives(*self._at(values), *self._laws)
+        """Each factor, linearised."""
+        e, *columns = odometry_derivatives(*self._states(values), *self._motions)
         blocks = (transposed.transpose(0, 2, 1) for transposed in columns)  # stored by columns, as GTSAM stores them
-        make = gtsam.JacobianFactor
         return [
-            make(i, A_i, j, A_j, b, A_b, rhs, UNIT)
+            gtsam.JacobianFactor(i, A_i, j, A_j, b, A_b, rhs, UNIT)
             for (i, j, b), A_i, A_j, A_b, rhs in zip(self._keys, *blocks, -e, strict=True)
         ]
 
-    def _at(self, values: gtsam.Values) -> tuple[Floats, Floats, Floats]:
+    def _states(self, values: gtsam.Values) -> tuple[Floats, Floats, Floats]:
         """Poses at both ends, as rows of R, and p, shape (n, 12) each, and ``b - b_0``, shape (n, 11)."""
-        poses_i, poses_j = poses_of(values, self._pose_keys)
+        X_i, X_j = poses_of(values, self._pose_keys)
         biases = np.array([values.atVector(key) for key in self._bias_keys])
-        return poses_i, poses_j, biases[self._biases] - self._bias_0
+        return X_i, X_j, biases[self._bias_of] - self._bias_0
 
 
-class OdometryWithBias(gtsam.CustomFactor):
-    """Relative pose from preintegrated gyro and DVL, and the biases b, of which ``D_bias`` has a column each.
+OdometryWithBias.Stack = OdometryStack
 
-    ``up_j``: u when the motion was set, shape (3,), along which ``D_bias`` has that turn; zero without gravity.
-    """
 
-    __slots__ = ("covariance", "law")
-    Stack: ClassVar = OdometryStack
+@compiled
+def odometry_errors(
+    X_i: Floats, X_j: Floats, changes: Floats, i_T_j: Floats, D: Floats, h: Floats, whitening: Floats
+) -> Floats:
+    """Whitened errors of n motions, shape (n, 6), from `OdometryStack._states` and `Motions`."""
+    errors = np.empty((len(i_T_j), 6))
+    for k in range(len(i_T_j)):
+        e = evaluated(X_i[k], X_j[k], changes[k], i_T_j[k], D[k], h[k])[0]
+        store_vector(mat6(whitening[k]) @ e, errors[k])
+    return errors
 
-    def __init__(
-        self, key_i: int, key_j: int, bias_key: int, motion: PreintegratedMotion, up_j: Floats = ORIGIN
-    ) -> None:
-        self.law, self.covariance = OdometryError((key_i, key_j, bias_key), motion, up_j), motion.covariance
-        super().__init__(gaussian(motion.covariance), [key_i, key_j, bias_key], self.law)
+
+@compiled
+def odometry_derivatives(
+    X_i: Floats, X_j: Floats, changes: Floats, i_T_j: Floats, D: Floats, h: Floats, whitening: Floats
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """As `odometry_errors`, with the transposed derivatives by both poses, shape (n, 6, 6), and b, shape (n, 11, 6)."""
+    n, biases = changes.shape
+    errors = np.empty((n, 6))
+    by_i = np.empty((n, 6, 6))
+    by_j = np.empty((n, 6, 6))
+    by_b = np.empty((n, biases, 6))
+    for k in range(n):
+        e, E, turned, c, turn, up = evaluated(X_i[k], X_j[k], changes[k], i_T_j[k], D[k], h[k])
+        W = mat6(whitening[k])
+        J = W @ log_derivative(e.a, E[1])
+        store_vector(W @ e, errors[k])
+        store_columns(J @ inverse_adjoint(turned), -1.0, by_i[k])
+        store_columns(J @ Mat6(I3, O3, O3, turn.T), 1.0, by_j[k])
+        # J(c)^-1 has the blocks V^T, 0, -V^T B, V^T
+        tilt, way = c
+        V_T = exp_and_mean(tilt)[1].T
+        V_T_B = V_T @ log_derivative(tilt, way).c
+        by_c = J @ inverse_adjoint(E)
+        by_psi = J @ Vec6(up, Vec3(0.0, 0.0, 0.0))
+        for m in range(biases):
+            a = V_T @ vec(D[k, :3, m])
+            column = by_c @ Vec6(a, V_T @ vec(D[k, 3:, m]) - V_T_B @ a)
+            h_m = h[k, m]
+            store_vector(Vec6(-1.0 * column.a - h_m * by_psi.a, -1.0 * column.b - h_m * by_psi.b), by_b[k, m])
+    return errors, by_i, by_j, by_b
+
+
+@inlined
+def evaluated(
+    X_i: Floats, X_j: Floats, change: Floats, mean: Floats, D: Floats, h: Floats
+) -> tuple[Vec6, tuple[Mat3, Vec3], tuple[Mat3, Vec3], tuple[Vec3, Vec3], Mat3, Vec3]:
+    """e; E; ``X_i^-1 X_j Exp(-psi u)``; c as a turn and the translation of Exp(c); Exp(-psi u) and u."""
+    R_i, p_i = pose(X_i)
+    R_j, p_j = pose(X_j)
+    R_m, p_m = pose(mean)
+    tilt = Vec3(0.0, 0.0, 0.0)
+    chord = Vec3(0.0, 0.0, 0.0)
+    psi = 0.0
+    for m in range(len(change)):
+        tilt = tilt + change[m] * vec(D[:3, m])
+        chord = chord + change[m] * vec(D[3:, m])
+        psi += h[m] * change[m]
+    exp_tilt, V = exp_and_mean(tilt)
+    way = V @ chord
+    up = R_j.z  # the last row of R_j: the world's vertical in body j
+    turn = exp_and_mean(-psi * up)[0]
+    turned_R = R_i.T @ R_j @ turn
+    turned_p = R_i.T @ (p_j - p_i)
+    corrected_R = R_m @ exp_tilt
+    corrected_p = R_m @ way + p_m
+    E_R = corrected_R.T @ turned_R
+    E_p = corrected_R.T @ (turned_p - corrected_p)
+    theta = rotation_log(E_R)
+    e = Vec6(theta, chord_inverse(theta) @ E_p)
+    return e, (E_R, E_p), (turned_R, turned_p), (tilt, way), turn, up
+
+
+@inlined
+def pose(rows: Floats) -> tuple[Mat3, Vec3]:
+    """R and p of the rows of R, and p, shape (12,)."""
+    return Mat3(vec(rows[:3]), vec(rows[3:6]), vec(rows[6:9])), vec(rows[9:])
+
+
+@inlined
+def log_derivative(theta: Vec3, t: Vec3) -> Mat6:
+    """J of the transform ``(Exp(theta), t)``: ``Log(T Exp(d)) ~ Log(T) + J d``."""
+    x = theta @ theta
+    along = theta @ t
+    a, slope = curvature(x)
+    V_inverse = rodrigues(theta, x, -0.5, a)
+    bent = slope * (along * theta - x * t) - 2.0 * a * t
+    B = outer(bent, theta) + a * outer(theta, t) + (a * along) * I3 + 0.5 * (I3 @ skew(t))
+    return Mat6(V_inverse.T, O3, B @ V_inverse.T, V_inverse.T)
+
+
+@inlined
+def inverse_adjoint(T: tuple[Mat3, Vec3]) -> Mat6:
+    """``Ad(T^-1)``."""
+    R, t = T
+    return Mat6(R.T, O3, -1.0 * (R.T @ skew(t)), R.T)
+
+
+@inlined
+def store_vector(v: Vec6, out: Floats) -> None:
+    """Write a vector into an array."""
+    out[0], out[1], out[2] = v.a
+    out[3], out[4], out[5] = v.b
+
+
+@inlined
+def store_columns(A: Mat6, sign: float, out: Floats) -> None:
+    """Write a matrix into an array, transposed and with a sign."""
+    T = A.T
+    for r, (left, right) in enumerate(((T.a, T.b), (T.c, T.d))):
+        for i, (v, w) in enumerate(((left.x, right.x), (left.y, right.y), (left.z, right.z))):
+            store_vector(Vec6(sign * v, sign * w), out[3 * r + i])
+
+
+def pose_row(pose: gtsam.Pose3) -> Floats:
+    """Rows of R, and p, shape (12,)."""
+    return np.concatenate((pose.rotation().matrix().ravel(), pose.translation()))

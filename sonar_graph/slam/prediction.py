@@ -1,27 +1,44 @@
 """Prediction of a sonar frame from the graph: range and azimuth of landmarks, with covariances.
 
-With the motion M from a keyframe X to the frame, its noise covariance Q, its derivative D by the gyro bias b, and the
-sonar mounted at T, the landmark p is expected at ``h(X M T, p)``, h of `sonar_graph.models.sonar`. The
-expectation has the covariance ``H P H' + H_M Q H_M'``: P of (X, b, p) together, ``H = [H_X, H_M D, H_p]``, H_M the
-derivative by the body's pose at the frame.
+With the motion M from a keyframe X to the frame, its noise covariance Q, its derivative D by the biases b, and the
+sonar mounted at T, the landmark p is expected at ``h(X M T, p)``, h of `sonar_graph.models.sonar`. The covariance of
+the expectation is::
+
+    S_0 = H P H' + H_M Q H_M',    H = [H_X, H_M D, H_p]
+
+P is the joint covariance of (X, b, p), H_M the derivative by the body's pose at the frame.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
 
 from sonar_graph.measurements import Floats
 from sonar_graph.models import view_points, wrap_angle
-from sonar_graph.navigation import PreintegratedMotion
+from sonar_graph.motion import PreintegratedMotion
 from sonar_graph.slam.smoother import JointCovariance
 
 IDENTITY = np.eye(2)
 
 
-@dataclass(frozen=True, eq=False)
-class ComparedRow:
-    """Detections of a frame beside what was expected of them."""
+class Tie(NamedTuple):
+    """Instant of a frame, tied to a keyframe by odometry."""
+
+    pose_key: int
+    bias_key: int | None
+    """Biases since the keyframe; None when none are estimated."""
+    motion: PreintegratedMotion
+    """M, from the keyframe to the frame."""
+
+    @property
+    def keys(self) -> list[int]:
+        """Variables on which the frame's pose depends."""
+        return [self.pose_key] if self.bias_key is None else [self.pose_key, self.bias_key]
+
+
+class Comparison(NamedTuple):
+    """Innovations of m detections."""
 
     innovation: Floats
     """Measured minus expected range (m) and azimuth (rad, wrapped), shape (m, 2)."""
@@ -30,11 +47,10 @@ class ComparedRow:
     distance: Floats
     """Squared Mahalanobis distance of the innovation, shape (m,)."""
     gain: Floats
-    """Larger of the expected variances relative to the noise, shape (m,): what a detection has to tell."""
+    """Larger ratio of expected variance to noise variance, shape (m,): the information that a detection adds."""
 
 
-@dataclass(frozen=True, eq=False)
-class Source:
+class Source(NamedTuple):
     """A point that is not in the graph, as located from a keyframe that is."""
 
     pose_key: int
@@ -51,49 +67,46 @@ class PredictedView:
 
     Parameters
     ----------
-    bias_key
-        Gyro bias since the keyframe; None when none is estimated.
-    motion
-        Motion from the keyframe to the frame.
+    tie
+        The frame, tied to the keyframe.
+    world_T_keyframe
+        X as estimated.
     covariance
-        Joint covariance of the keyframe, the bias and the landmarks.
+        Joint covariance of the keyframe, its biases and the landmarks.
     """
 
     def __init__(
-        self,
-        pose_key: int,
-        bias_key: int | None,
-        world_T_keyframe: gtsam.Pose3,
-        motion: PreintegratedMotion,
-        body_T_sonar: gtsam.Pose3,
-        covariance: JointCovariance,
+        self, tie: Tie, world_T_keyframe: gtsam.Pose3, body_T_sonar: gtsam.Pose3, covariance: JointCovariance
     ) -> None:
+        motion = tie.motion
         keyframe_T_sonar = motion.i_T_j.compose(body_T_sonar)
         self.world_T_sonar = world_T_keyframe.compose(keyframe_T_sonar)
         """Pose of the sonar at the frame."""
         self._world_T_keyframe = world_T_keyframe
-        self.covariance = covariance
+        self._covariance = covariance
         self._motion = motion
-        self._pose_row = covariance.rows[pose_key]
+        self._pose_row = covariance.rows[tie.pose_key]
         self._by_body = body_T_sonar.inverse().AdjointMap()
         """Derivative of the sonar's pose by the body's, both at the frame, shape (6, 6)."""
         self._by_state = np.zeros((6, len(covariance.matrix)))
-        """Derivative of the sonar's pose by all variables of the covariance, of which keyframe and bias count."""
+        """Derivative of the sonar's pose by all variables of the covariance; only keyframe and biases count."""
         self._by_state[:, self._pose_row : self._pose_row + 6] = keyframe_T_sonar.inverse().AdjointMap()
-        if bias_key is not None:
-            row = covariance.rows[bias_key]
+        if tie.bias_key is not None:
+            row = covariance.rows[tie.bias_key]
+            # the biases bend the motion, whose perturbation is that of the body at the frame
             self._by_state[:, row : row + len(motion.bias)] = self._by_body @ motion.D_bias
 
     def height_variance(self, point: Floats) -> float:
         """Variance of the world z of a point fixed to the body at the frame, shape (3,) in the world, m².
 
-        By keyframe and motion; the gyro bias, which turns about the vertical most of all, is left out.
+        Keyframe and motion count. The gyro bias is left out: it turns mostly about the vertical.
         """
+        row = self._pose_row
+        P = self._covariance.matrix[row : row + 6, row : row + 6]
+        Q = self._motion.covariance
         by_keyframe = _height_derivative(self._world_T_keyframe, point)
         by_body = _height_derivative(self._world_T_keyframe.compose(self._motion.i_T_j), point)
-        r = self._pose_row
-        P = self.covariance.matrix[r : r + 6, r : r + 6]
-        return float(by_keyframe @ P @ by_keyframe + by_body @ self._motion.covariance @ by_body)
+        return float(by_keyframe @ P @ by_keyframe + by_body @ Q @ by_body)
 
     def expect(self, keys: list[int], points: Floats) -> tuple[Floats, Floats]:
         """Expected range and azimuth of landmarks at points of the world, shape (m, 3).
@@ -103,7 +116,8 @@ class PredictedView:
         Range (m) and azimuth (rad), shape (m, 2), and their covariances, shape (m, 2, 2).
         """
         predicted, joint = self.expect_jointly(keys, points, [])
-        return predicted, np.einsum("kikj->kij", joint.reshape(len(keys), 2, len(keys), 2))
+        m = len(keys)
+        return predicted, np.einsum("kikj->kij", joint.reshape(m, 2, m, 2))  # blocks on the diagonal
 
     def expect_jointly(self, keys: list[int], points: Floats, sources: list[Source]) -> tuple[Floats, Floats]:
         """Joint expectation of landmarks of the graph, shape (m, 3), and of points that are not in it.
@@ -112,44 +126,57 @@ class PredictedView:
         -------
         Range (m) and azimuth (rad), shape (m + s, 2), and their joint covariance, shape (2 (m + s), 2 (m + s)).
         """
-        everywhere = np.array([*points, *(source.point for source in sources)]).reshape(-1, 3) if sources else points
-        predicted, by_sonar, by_point = view_points(self.world_T_sonar, everywhere)
-        rows, P, n = self.covariance.rows, self.covariance.matrix, len(everywhere)
-        H = by_sonar @ self._by_state
+        if sources:
+            points = np.array([*points, *(source.point for source in sources)])
+        predicted, by_sonar, by_point = view_points(self.world_T_sonar, points)
+        rows = self._covariance.rows
+        P = self._covariance.matrix
+        Q = self._motion.covariance
+        n = len(points)
+        H = by_sonar @ self._by_state  # (n, 2, N)
         for k, key in enumerate(keys):
             H[k, :, rows[key] : rows[key] + 3] = by_point[k]
         for k, source in enumerate(sources, start=len(keys)):
+            # += : the point may have been seen from the keyframe itself
             H[k, :, rows[source.pose_key] : rows[source.pose_key] + 6] += by_point[k] @ source.by_pose
-        J, J_M = H.reshape(2 * n, len(P)), (by_sonar @ self._by_body).reshape(2 * n, 6)
-        joint = J @ P @ J.T + J_M @ self._motion.covariance @ J_M.T
+        H = H.reshape(2 * n, len(P))
+        H_M = (by_sonar @ self._by_body).reshape(2 * n, 6)
+        joint = H @ P @ H.T + H_M @ Q @ H_M.T
         for k, source in enumerate(sources, start=len(keys)):
+            # own noise of the point, independent of all variables of the graph
             joint[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += by_point[k] @ source.cov @ by_point[k].T
         return predicted, np.asarray(0.5 * (joint + joint.T))
 
-    def compare(self, keys: list[int], points: Floats, z: Floats, cov: Floats) -> ComparedRow:
+    def compare(self, keys: list[int], points: Floats, z: Floats, cov: Floats) -> Comparison:
         """Detections z, shape (m, 2), with noise (m, 2, 2), of landmarks at points of the world, shape (m, 3)."""
-        return weigh(z, *self.expect(keys, points), cov)
+        predicted, prior_cov = self.expect(keys, points)
+        return weigh(z, predicted, prior_cov, cov)
 
     def blurred(self, cov: Floats, motion: PreintegratedMotion, points: Floats) -> Floats:
         """Noise of range and azimuth of points of the world, (m, 2, 2), with that of a motion that ends at the frame.
 
-        The motion's part is added to each variance; that it correlates range and azimuth a little is left out.
+        Only the variances grow. The motion also correlates range and azimuth a little, which is left out.
         """
-        H_M = view_points(self.world_T_sonar, points).by_sonar @ self._by_body
-        return cov + IDENTITY * (H_M @ motion.covariance * H_M).sum(axis=2)[:, None]
+        H_M = view_points(self.world_T_sonar, points).by_sonar @ self._by_body  # (m, 2, 6)
+        variances = (H_M @ motion.covariance * H_M).sum(axis=2)  # diagonals of H_M Q H_M'
+        return cov + IDENTITY * variances[:, None]
 
 
-def weigh(z: Floats, expected: Floats, prior_cov: Floats, cov: Floats) -> ComparedRow:
-    """Compare m detections and their noise with what was expected and its covariance."""
-    innovation, S = z - expected, prior_cov + cov
+def weigh(z: Floats, expected: Floats, prior_cov: Floats, cov: Floats) -> Comparison:
+    """Compare m detections and their noise with the expectation and its covariance."""
+    innovation = z - expected
     innovation[:, 1] = wrap_angle(innovation[:, 1])
-    (r, alpha), (a, b, _, c) = innovation.T, S.reshape(-1, 4).T
+    S = prior_cov + cov
+    r, alpha = innovation.T
+    a, b, _, c = S.reshape(-1, 4).T
+    # e' S^-1 e with the closed inverse of a 2 x 2 matrix
     distance = (c * r**2 - 2.0 * b * r * alpha + a * alpha**2) / (a * c - b**2)
     gain = np.maximum(prior_cov[:, 0, 0] / cov[:, 0, 0], prior_cov[:, 1, 1] / cov[:, 1, 1])
-    return ComparedRow(innovation, S, distance, gain)
+    return Comparison(innovation, S, distance, gain)
 
 
 def _height_derivative(world_T_body: gtsam.Pose3, point: Floats) -> Floats:
     """Derivative of the world z of a point of the body by the right perturbation of its pose, shape (6,)."""
-    (x, y, z), (a, b, c) = world_T_body.transformTo(point).tolist(), world_T_body.rotation().matrix()[2].tolist()
-    return np.array([y * c - z * b, z * a - x * c, x * b - y * a, a, b, c])
+    up = world_T_body.rotation().matrix()[2]
+    q = world_T_body.transformTo(point)
+    return np.concatenate((np.cross(q, up), up))

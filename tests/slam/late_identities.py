@@ -36,7 +36,7 @@ GAP_S = 0.7
 
 
 def from_the_start(sequence: Sequence) -> Sequence:
-    """The same, had each track's last belief been its first."""
+    """The same, had the last posterior of each track been its first."""
     seen = sequence.detections
     beliefs = seen.id_probability.copy()
     for number in set(seen.track.tolist()) - {-1}:
@@ -57,7 +57,7 @@ def assert_outcomes_account(estimator: Isam2, sequence: Sequence) -> Counter:
 
 
 def on_the_rail(beliefs_of_7: list[list[float]], beliefs_of_4: list[float]) -> Sequence:
-    """One track a landmark; what is believed of 7 in its first, second, ... frame, the last for the rest."""
+    """One track a landmark; posteriors of 7 in its first, second, ... frame, the last for the rest."""
     sequence, _ = rail()
     seen = sequence.detections
     track = np.where(seen.candidate_ids[:, 0] == 7, 70, 40)

@@ -2,6 +2,7 @@
 
 from itertools import product
 
+import gtsam
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
@@ -10,10 +11,12 @@ from scipy.stats import chi2, multivariate_normal
 
 from sonar_graph.measurements import NO_TRACK, Floats, LandmarkDetections
 from sonar_graph.models import ACCEPTED, identify
-from sonar_graph.slam.landmarks import AmendableJournal
-from sonar_graph.slam.landmarks.joint_compatibility import UNPAIRED, Innovations, Pairing, believed, pair_jointly
+from sonar_graph.slam.landmarks.joint_compatibility import UNPAIRED, Innovations, Pairing, drop_unlikely, pair_jointly
+from sonar_graph.slam.landmarks.landmark_graph import AmendableJournal, Assignment
 from sonar_graph.slam.landmarks.mixture import LEAST_LANDMARKS, IdentityPosterior, RecogniserErrors
+from sonar_graph.slam.landmarks.sighting import Sighting
 from sonar_graph.slam.landmarks.tracked import NO_LANDMARK, UNDECIDED, decide, second_rows_of_tracks
+from sonar_graph.slam.smoother import Sightline
 from sonar_graph.states import OUTCOME_NUMBERS, Outcome
 
 from .made import detected
@@ -43,10 +46,14 @@ def test_the_most_probable_identity_is_accepted(rows: tuple, least: float, ids: 
 
 def test_a_row_is_amended_in_its_place_and_loses_its_innovation():
     journal = AmendableJournal()
-    rows = [journal.record(5, 2, Outcome.USED, np.ones(2), np.eye(2)), journal.record(6, 3, Outcome.WAITING)]
-    assert rows == [0, 1]
-    journal.amend(0, Outcome.MOVED, 7)
-    journal.amend(1, Outcome.FORGOTTEN)
+    sightings = [
+        Sighting(stamp_ns, row, Sightline(0, gtsam.Pose3(), np.ones(2)), np.eye(2))
+        for row, stamp_ns in enumerate((5, 6))
+    ]
+    assert journal.record(5, 2, Outcome.USED, np.ones(2), np.eye(2)) == 0
+    assert journal.record(6, 3, Outcome.WAITING) == 1
+    journal.amend(Assignment(sightings[0], Outcome.MOVED, 7))
+    journal.amend(Assignment(sightings[1], Outcome.FORGOTTEN))
     log = journal.log()
     assert log.outcomes == [Outcome.MOVED, Outcome.FORGOTTEN]
     assert log.landmark_ids.tolist() == [7, 3]
@@ -215,11 +222,11 @@ def test_an_error_that_all_share_does_not_mislead_joint_compatibility():
 
 
 @pytest.mark.parametrize("sigma", [0.1, 0.5, 2.0])
-def test_a_pair_is_believed_when_it_is_denser_than_its_rival(sigma: float):
+def test_a_pair_is_kept_when_it_is_denser_than_its_rival(sigma: float):
     case = Innovations(np.array([[[0.1, 0.0]]]), sigma**2 * np.eye(2), 1e-6 * np.eye(2)[None])
     density = multivariate_normal.logpdf([0.1, 0.0], cov=(sigma**2 + 1e-6) * np.eye(2))
     for rival, size in ((density - 1e-6, 1), (density + 1e-6, 0)):
-        assert believed(case, Pairing((0,), 0.0), np.array([rival])).size == size
+        assert drop_unlikely(case, Pairing((0,), 0.0), np.array([rival])).size == size
 
 
 def test_two_that_share_a_wide_error_support_each_other_but_not_where_they_may_be_anywhere():
@@ -228,20 +235,20 @@ def test_two_that_share_a_wide_error_support_each_other_but_not_where_they_may_b
     Each given the other is denser than a rival of 3 a unit; where both are together is not.
     """
     rival, case, both = np.log(np.full(2, 0.2)), shifted(), Pairing((0, 1), 0.0)
-    assert believed(case, both, rival).landmarks == (0, 1)
-    assert believed(case, Pairing((0, UNPAIRED), 0.0), rival).size == 0
+    assert drop_unlikely(case, both, rival).landmarks == (0, 1)
+    assert drop_unlikely(case, Pairing((0, UNPAIRED), 0.0), rival).size == 0
     e, C = case.of(both.landmarks)
     together = multivariate_normal.logpdf(e, cov=C)
     given_the_other = together - multivariate_normal.logpdf(e[2:], cov=C[2:, 2:])
     assert given_the_other > np.log(3.0) > together / 2
-    assert believed(case, both, np.log(np.full(2, 3.0))).size == 0
+    assert drop_unlikely(case, both, np.log(np.full(2, 3.0))).size == 0
 
 
-def test_a_pair_that_the_others_speak_against_is_dropped():
+def test_a_pair_that_the_others_contradict_is_dropped():
     """The third lies where the common error of the first two does not let it be."""
     expected = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
     z: Floats = expected + np.array([[0.8, 0.0], [0.8, 0.0], [-0.3, 0.6]])
     shared = np.tile(np.eye(2), (3, 1))
     cov = shared @ shared.T + 1e-4 * np.eye(6)
     case = Innovations(z[:, None] - expected[None], cov, np.tile(SIGMA**2 * np.eye(2), (3, 1, 1)))
-    assert believed(case, Pairing((0, 1, 2), 0.0), np.log(np.full(3, 0.2))).landmarks == (0, 1, UNPAIRED)
+    assert drop_unlikely(case, Pairing((0, 1, 2), 0.0), np.log(np.full(3, 0.2))).landmarks == (0, 1, UNPAIRED)

@@ -1,4 +1,8 @@
-"""Detections of a straight dive: gate, first place of a landmark, noise of the motion, waiting."""
+"""Detections of a straight dive: gate, first place of a landmark, noise of the motion, waiting; steps of a policy."""
+
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -8,12 +12,22 @@ from scipy.stats import chi2
 
 from sonar_graph.calibration import DvlCalibration, FloorPrior, SonarCalibration, Start
 from sonar_graph.measurements import Floats
+from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 from sonar_graph.slam import GaussianKernel, KeyframeParams, RobustKernel
+from sonar_graph.slam.landmarks import (
+    Decision,
+    IdentityPolicy,
+    LandmarkGraph,
+    MixtureIdentities,
+    NamelessLandmarks,
+    TrackedIdentities,
+)
 from sonar_graph.slam.smoother import Smoother
 from sonar_graph.states import Outcome
 
 from .dive import CALIBRATION, FLOOR, NS, POLICY, SONAR, T0_NS, UNGATED, Dive, spherical
 from .graphs import block_of, factors_of
+from .late_identities import BASIN, POLICIES, SURE, TROUBLES, run, see
 from .made import detected, polar, smoother_with
 
 BEAM = np.array([np.cos(0.2) * np.cos(0.4), np.sin(0.2) * np.cos(0.4), -np.sin(0.4)])
@@ -141,7 +155,7 @@ def test_a_kernel_keeps_an_outlier_from_pulling(kernel):
 
 
 def test_factors_of_a_frame_off_its_keyframe_carry_the_noise_of_the_motion():
-    """0.35 s of a Doppler log of 0.2 m/s: the range factor is as doubtful as what `View.blurred` says."""
+    """0.35 s of a Doppler log of 0.2 m/s: the range factor has the noise of `PredictedView.blurred`."""
     sigmas = []
     for after_s in (0.0, 0.35):
         off_it = dive_with(dvl=DvlCalibration(velocity_sigma_m_s=(0.2, 0.2, 0.2)))
@@ -179,7 +193,7 @@ DOUBTFUL_HEIGHT = Start(position_sigma_m=(0.05, 0.02, 2.0), rpy_sigma_rad=(0.01,
     [(0.6, CALIBRATION.start), (0.9, DOUBTFUL_HEIGHT)],
     ids=["near", "far, of a doubtful height"],
 )
-def test_a_floor_out_of_the_aperture_is_believed_all_the_same(below_rad: float, start: Start):
+def test_a_floor_out_of_the_aperture_is_accepted_all_the_same(below_rad: float, start: Start):
     """0.2 rad below the centre beam, where half the aperture is 0.12 rad: first put on the beam, then on the floor."""
     floor = FloorPrior(z_m=-0.1 - 3.0 * np.sin(below_rad), sigma_m=0.01)
     dive = dive_with(floor=floor, start=start)
@@ -191,7 +205,7 @@ def test_a_floor_out_of_the_aperture_is_believed_all_the_same(below_rad: float, 
 
 
 def test_a_landmark_that_cannot_stand_on_the_floor_does_not_drag_the_vehicle_there():
-    """0.5 rad below the centre beam is seven sigmas of the aperture: no floor is said, but the aperture is."""
+    """0.5 rad below the centre beam is seven sigmas of the aperture, which has a factor then, and the floor none."""
     dive, without = dive_with(floor=FloorPrior(z_m=-0.1 - 3.0 * np.sin(0.9), sigma_m=0.01)), Dive()
     for each in (dive, without):
         each.see(0.0, (5, 3.0, 0.0))
@@ -200,7 +214,7 @@ def test_a_landmark_that_cannot_stand_on_the_floor_does_not_drag_the_vehicle_the
     assert dive.smoother.values.atPose3(X(0)).equals(gtsam.Pose3(), 1e-9)
 
 
-def test_elevation_is_said_once_for_a_landmark():
+def test_elevation_is_one_factor_a_landmark():
     """It does not vary as noise would: many sightings from one place leave its height as unknown as the first."""
     dive = dive_with(start=CERTAIN)
     for k in range(9):
@@ -224,7 +238,7 @@ def range_variance(dive: Dive) -> float:
     return float(BEAM @ dive.smoother.marginals.marginalCovariance(L(5)) @ BEAM)
 
 
-def test_sightings_wait_until_together_they_have_something_to_tell():
+def test_sightings_wait_until_together_they_add_enough_information():
     """After n sightings range and azimuth are known to 1/n of the noise: the next adds 1/n, but a refused one 0."""
     dive, known, waited = waiting(0.45), [], []
     for _ in range(6):
@@ -250,3 +264,62 @@ def test_what_waits_is_used_with_the_next_keyframe_or_landmark(what):
     else:
         dive.see(0.0, (6, 3.0, 0.3))
     assert range_variance(dive) == pytest.approx(0.02**2 / 4, rel=0.01)
+
+
+STEPS = ["retract", "associate", "rivals", "judge", "held", "reconsider", "forget"]
+DECIDING = [TrackedIdentities, NamelessLandmarks, MixtureIdentities]
+
+
+def watched(monkeypatch: pytest.MonkeyPatch, watch: Callable[[IdentityPolicy, str, Callable[[], Any]], Any]) -> None:
+    """From now on each step of a policy runs in ``watch(policy, name, step)``."""
+
+    def wrapped(name: str, step: Callable[..., Any]) -> Callable[..., Any]:
+        return lambda policy, *given: watch(policy, name, lambda: step(policy, *given))
+
+    for kind in DECIDING:
+        for name in STEPS:
+            monkeypatch.setattr(kind, name, wrapped(name, getattr(kind, name)))
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+def test_a_policy_only_decides_and_graph_landmarks_and_journal_change_between_its_steps(policy: str, monkeypatch):
+    sequence = simulate_basin(BasinOptions(**BASIN, **TROUBLES["late and wrong"], anonymous_share=0.3))
+    decided: Counter[str] = Counter()
+
+    def seen(landmarks: LandmarkGraph) -> tuple:
+        log = landmarks.journal.log()
+        return landmarks.sizes(), landmarks.smoother.graph.size(), log.outcomes, log.landmark_ids.tolist()
+
+    def watch(deciding: IdentityPolicy, name: str, step: Callable[[], Any]) -> Any:
+        before = seen(deciding.landmarks)
+        found = step()
+        assert seen(deciding.landmarks) == before
+        decided[name] += isinstance(found, Decision) and not found.is_empty
+        return found
+
+    watched(monkeypatch, watch)
+    run(sequence, **POLICIES[policy])
+    assert decided["judge"] > 10
+    assert decided["reconsider" if policy == "max-mixture" else "associate"] > 0
+
+
+def test_a_renamed_track_is_retracted_then_associated_and_then_judged(monkeypatch):
+    """Each in a decision of its own, so that the landmark begins where the right sightings put it."""
+    world, steps = Dive(identity=UNGATED), []
+
+    def watch(_: IdentityPolicy, name: str, step: Callable[[], Any]) -> Any:
+        found = step()
+        if isinstance(found, Decision) and not found.is_empty:
+            steps.append((name, [(each.outcome, each.landmark_id) for each in found.assignments]))
+        return found
+
+    see(world, 0.0, SURE[5])
+    see(world, 0.5, SURE[5])
+    watched(monkeypatch, watch)
+    see(world, 1.0, SURE[7])
+    assert steps == [
+        ("retract", [(Outcome.TAKEN_BACK, None)] * 2),
+        ("associate", [(Outcome.MOVED, 7)] * 2),
+        ("judge", [(Outcome.USED, 7)]),
+    ]
+    assert world.sightings.landmarks.ids == [7]

@@ -22,7 +22,7 @@ from sonar_graph.slam.landmarks.mixture import (
     TrackedObject,
 )
 from sonar_graph.slam.landmarks.sighting import Sighting
-from sonar_graph.slam.smoother.batch_solution import Sightline
+from sonar_graph.slam.smoother import Sightline
 
 from .made import plain, polar, values_of
 
@@ -157,7 +157,7 @@ def test_gains_are_densities_over_that_of_no_landmark() -> None:
     watches, points = some_watches(values), np.array([PLACES[7], PLACES[4] + [0.0, 0.05, 0.0]])
     found = MIXTURE.gains(7, watches, points, values)
     for n, seen in enumerate(watches):
-        named, none = log_weights(seen.statement.probability, 7)
+        named, none = log_weights(seen.posterior.probability, 7)
         for k, point in enumerate(points):
             expected = named + log_density(values, seen, point) - none - of_nothing(seen)
             assert found[n, k] == pytest.approx(expected, rel=1e-9)
@@ -175,7 +175,7 @@ def test_a_landmark_that_one_watch_has_put_where_it_is_has_no_place_for_it(is_al
     assert found[0][7] == pytest.approx(weight + (of_nothing(own) if is_alone else in_place))
     assert found[0][4] == pytest.approx(log_weights({7: 0.9}, 4)[0] + log_density(values, own, PLACES[4]))
     assert found[0][None] == pytest.approx(none + of_nothing(own))
-    others_weight = log_weights(other.statement.probability, 7)[0]
+    others_weight = log_weights(other.posterior.probability, 7)[0]
     assert found[1][7] == pytest.approx(others_weight + log_density(values, other, PLACES[7]))
     assert found[2][4] == pytest.approx(log_weights({}, 4)[0] + log_density(values, third, PLACES[4]))
     assert [list(row) for row in found] == [[4, 7, None]] * 3
@@ -193,7 +193,7 @@ def test_the_best_choices_are_the_most_probable_of_all(seed: int) -> None:
     found = MIXTURE.best(watches, values, [None] * 5, dict.fromkeys(PLACES, 9))
     table: list[dict[int | None, float]] = []
     for seen in watches:
-        weights = {i: log_weights(seen.statement.probability, i) for i in PLACES}
+        weights = {i: log_weights(seen.posterior.probability, i) for i in PLACES}
         placed = {i: named + log_density(values, seen, PLACES[i]) for i, (named, _) in weights.items()}
         table.append(placed | {None: weights[7][1] + of_nothing(seen)})
     total = {}

@@ -23,7 +23,7 @@ from sonar_graph.models import (
     wrap_angle,
 )
 from sonar_graph.navigation import PreintegratedMotion
-from sonar_graph.slam.prediction import PredictedView, Source, weigh
+from sonar_graph.slam.prediction import PredictedView, Source, Tie, weigh
 from sonar_graph.slam.smoother import JointCovariance
 from sonar_graph.testing import check_derivative
 from sonar_graph.testing.numerical import central_differences
@@ -130,7 +130,7 @@ def ahead(keyframe: gtsam.Pose3, motion: PreintegratedMotion, azimuth_rad: float
 
 
 def made(keyframe, motion, joint, bias: bool = True) -> PredictedView:
-    return PredictedView(X(2), B(0) if bias else None, keyframe, motion, BODY_T_SONAR, joint)
+    return PredictedView(Tie(X(2), B(0) if bias else None, motion), keyframe, BODY_T_SONAR, joint)
 
 
 def expected_of(view: PredictedView, landmarks: dict[int, Floats], *ids: int) -> tuple[Floats, Floats]:
@@ -224,7 +224,7 @@ def test_weighing_is_mahalanobis_of_the_wrapped_innovation(
 
     prior, noise = cov(0.1, azimuth_sigma, by_prior), cov(0.02, 0.01, by_noise)
     z, predicted = np.array([[3.0 + range_off, measured]]), np.array([[3.0, expected]])
-    (innovation,), (S,), (distance,), (gain,) = vars(weigh(z, predicted, prior[None], noise[None])).values()
+    (innovation,), (S,), (distance,), (gain,) = weigh(z, predicted, prior[None], noise[None])
     assert innovation[0] == pytest.approx(range_off)
     assert abs(innovation[1]) <= np.pi + 1e-12
     assert np.exp(1j * (innovation[1] - (measured - expected))) == pytest.approx(1.0)

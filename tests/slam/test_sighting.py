@@ -13,7 +13,8 @@ from scipy.optimize import least_squares
 from sonar_graph.calibration import FloorPrior, SonarCalibration
 from sonar_graph.measurements import Floats
 from sonar_graph.slam.landmarks.landmark_graph import AmendableJournal, Assignment, LandmarkGraph
-from sonar_graph.slam.landmarks.sighting import Sighting, SightingFactors, place
+from sonar_graph.slam.landmarks.sighting import Sighting, SightingFactors
+from sonar_graph.slam.landmarks.unknown import place
 from sonar_graph.slam.smoother import Changed, Sightline
 from sonar_graph.states import Outcome
 
@@ -41,14 +42,19 @@ def begun() -> LandmarkGraph:
 def sighting_of(landmark_id: int, k: int, floor: FloorPrior | None, landmarks: LandmarkGraph) -> Sighting:
     z = polar(landmarks.smoother.values.atPose3(X(k)), PLACES[landmark_id])
     row = landmarks.journal.record(k, landmark_id, Outcome.WAITING)
-    return Sighting(k, row, Sightline(X(k), gtsam.Pose3(), z), NOISE, floor, outcome=Outcome.WAITING)
+    sighting = Sighting(k, row, Sightline(X(k), gtsam.Pose3(), z), NOISE, floor)
+    landmarks.apply([Assignment(sighting, Outcome.WAITING)], float(POSES))
+    return sighting
 
 
 def change(landmarks: LandmarkGraph, changes: list[tuple[Sighting, int | None]]) -> None:
-    """Sightings are from now on of landmarks, or of none."""
+    """Give sightings to landmarks, or to none."""
     later = {Outcome.WAITING: Outcome.USED_LATER}
     landmarks.apply(
-        [Assignment(s, later.get(s.outcome, Outcome.MOVED) if i else Outcome.TAKEN_BACK, i) for s, i in changes],
+        [
+            Assignment(s, later.get(landmarks.state(s).outcome, Outcome.MOVED) if i else Outcome.TAKEN_BACK, i)
+            for s, i in changes
+        ],
         float(POSES),
     )
 
@@ -72,11 +78,11 @@ def errors(graph: gtsam.NonlinearFactorGraph, ids: list[int], landmarks: Landmar
 @settings(max_examples=25, deadline=None)
 @given(st.lists(st.lists(st.sampled_from([7, 9, None]), min_size=POSES, max_size=POSES), min_size=1, max_size=3))
 def test_whatever_came_and_went_the_graph_is_that_of_what_is_left(floor: FloorPrior | None, stages: list) -> None:
-    """Each stage says of which landmark each sighting is from now on; the first to come is often not the earliest."""
+    """Each stage gives each sighting to a landmark or none; the first to come is often not the earliest."""
     landmarks = begun()
     seen, of = [sighting_of(7, k, floor, landmarks) for k in range(POSES)], dict[Sighting, int]()
     for stage in stages:
-        change(landmarks, [(s, i) for s, i in zip(seen, stage, strict=True) if s.landmark_id != i])
+        change(landmarks, [(s, i) for s, i in zip(seen, stage, strict=True) if landmarks.state(s).landmark_id != i])
         of = {s: i for s, i in zip(seen, stage, strict=True) if i is not None}
         expected, ids = graph_of(landmarks.smoother.graph.at(k) for k in range(POSES)), sorted(set(of.values()))
         for i in ids:
@@ -86,21 +92,6 @@ def test_whatever_came_and_went_the_graph_is_that_of_what_is_left(floor: FloorPr
         assert landmarks.smoother.graph.nrFactors() == expected.nrFactors()
         assert errors(landmarks.smoother.graph, ids, landmarks) == pytest.approx(errors(expected, ids, landmarks))
         assert landmarks.ids == landmarks.smoother.landmark_ids == ids
-
-
-@pytest.mark.parametrize("earliest_first", [True, False])
-def test_what_is_said_once_is_said_by_the_earliest(earliest_first: bool) -> None:
-    """Also when it comes last, and when it goes again; without a floor the elevation is of it."""
-    landmarks = begun()
-    early, middle, late = (sighting_of(7, k, None, landmarks) for k in (0, 2, 4))
-    for s in (early, middle, late) if earliest_first else (late, middle, early):
-        change(landmarks, [(s, 7)])
-    store = landmarks.smoother._store
-    counts = [len(store.factors([s.handle])) for s in (early, middle, late)]
-    assert counts == [3, 2, 2]  # first_direction beside range and azimuth
-    change(landmarks, [(early, None)])
-    assert early.handle is None
-    assert [len(store.factors([s.handle])) for s in (middle, late)] == [3, 2]
 
 
 def test_a_landmark_whose_sightings_have_left_counts_as_one_more() -> None:
@@ -122,21 +113,23 @@ def test_a_landmark_whose_sightings_have_left_counts_as_one_more() -> None:
 @pytest.mark.parametrize(
     ("before", "after"),
     [
-        (Outcome.FORGOTTEN, Outcome.USED_LATER),
-        (Outcome.NO_IDENTITY, Outcome.WAITING),
-        (Outcome.WAITING, Outcome.TAKEN_BACK),
-        (Outcome.GATED, Outcome.USED_LATER),
-        (None, Outcome.FORGOTTEN),
-        (Outcome.WAITING, Outcome.WITHHELD),
+        ([Outcome.FORGOTTEN], Outcome.USED_LATER),
+        ([], Outcome.TAKEN_BACK),
+        ([Outcome.GATED], Outcome.USED_LATER),
+        ([], Outcome.WITHHELD),
+        ([Outcome.USED_LATER, Outcome.TAKEN_BACK], Outcome.USED),
     ],
 )
-def test_a_state_that_may_not_follow_is_refused_and_changes_nothing(before: Outcome | None, after: Outcome) -> None:
+def test_a_state_that_may_not_follow_is_refused_and_changes_nothing(before: list[Outcome], after: Outcome) -> None:
+    """From waiting by way of other states."""
     landmarks = begun()
     sighting = sighting_of(7, 0, None, landmarks)
-    sighting.outcome = before
+    for outcome in before:
+        landmarks.apply([Assignment(sighting, outcome, 7)], float(POSES))
+    state, outcomes = landmarks.state(sighting).outcome, landmarks.journal.log().outcomes
     with pytest.raises(AssertionError, match="cannot become"):
         landmarks.apply([Assignment(sighting, after, 7)], float(POSES))
-    assert (sighting.outcome, landmarks.ids, landmarks.journal.log().outcomes) == (before, [], [Outcome.WAITING])
+    assert (landmarks.state(sighting).outcome, landmarks.ids, landmarks.journal.log().outcomes) == (state, [], outcomes)
 
 
 MOUNTED = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.0, 0.4, 0.0), np.array([0.3, 0.0, -0.1]))

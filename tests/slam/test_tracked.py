@@ -100,7 +100,7 @@ FRAMES = 6
 
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.lists(BELIEFS, min_size=3, max_size=3), min_size=FRAMES - 1, max_size=FRAMES - 1))
-def test_whatever_was_believed_before_the_graph_is_that_of_the_last_beliefs(histories: list[list[list[float]]]):
+def test_whatever_identities_came_before_the_graph_is_that_of_the_last_ones(histories: list[list[list[float]]]):
     """Also where tracks change places, all at once, or claim one landmark together."""
     last = [SURE[4], SURE[5], SURE[7]]
     believed, known = (Watch(identity=UNGATED, kernel=RobustKernel(width=2.0)) for _ in range(2))
@@ -116,7 +116,7 @@ def test_whatever_was_believed_before_the_graph_is_that_of_the_last_beliefs(hist
 
 
 def test_whether_it_stands_on_the_floor_is_judged_where_it_was_seen():
-    """An object high above the floor and one on it, known late: what is said of heights is as if known at once."""
+    """An object high above the floor and one on it, known late: the factors of heights are as if known at once."""
     for height_m, factors_on_height in ((OBJECTS[0][2] - 1.2, 0), (OBJECTS[0][2], 1)):
         floor = FloorPrior(z_m=height_m, sigma_m=0.01)
         late, known = (Dive(CALIBRATION.model_copy(update={"floor": floor})) for _ in range(2))
@@ -182,7 +182,7 @@ def answers(policy: str, seed: int | None, source: type[Odometry] = Odometry) ->
 
 
 @pytest.mark.parametrize("policy", CUT)
-def test_no_bit_depends_on_how_a_log_is_cut_into_calls_or_on_what_is_asked(policy: str):
+def test_no_bit_depends_on_how_a_log_is_cut_into_calls_or_on_questions(policy: str):
     seldom = answers(policy, None)
     assert len(seldom.estimates) > 10
     assert unlike(seldom, answers(policy, 1)) == []
@@ -207,7 +207,7 @@ def test_cut_invariance_sees_a_trillionth_of_a_metre():
 
 @pytest.mark.parametrize("asked", [False, True])
 def test_a_track_that_is_over_decides_no_longer_which_of_its_rows_counts(asked: bool):
-    """Also where nobody asked for the outcomes in between, upon which it is forgotten."""
+    """Also without a question for the outcomes in between, which forgets the track."""
     dive = Dive(identity=TRUSTING.model_copy(update={"longest_wait_s": 1.0}))
     see(dive, 0.0, SURE[5])
     if asked:
@@ -219,7 +219,7 @@ def test_a_track_that_is_over_decides_no_longer_which_of_its_rows_counts(asked: 
 
 
 @pytest.mark.parametrize("policy", POLICIES)
-def test_the_journal_says_of_each_sighting_in_the_graph_what_it_is_of(policy: str):
+def test_the_journal_has_the_landmark_of_each_sighting_in_the_graph(policy: str):
     sequence = simulate_basin(BasinOptions(**BASIN, **TROUBLES["late and wrong"], anonymous_share=0.3))
     estimator = run(sequence, **POLICIES[policy])
     landmarks = estimator._frontend.landmarks
@@ -374,7 +374,7 @@ def test_without_deferring_the_rail_does_not_end_there():
     assert abs(estimator.landmarks().positions[1, 0] - mean["l7"]) > 2e-4
 
 
-def test_a_wrong_identity_that_is_not_taken_back_leaves_another_graph():
+def test_a_wrong_identity_that_is_not_retracted_leaves_another_graph():
     sequence = simulate_basin(BasinOptions(**BASIN, **TROUBLES["wrong"], gyro_bias_scale=0.0))
     estimator, known = run(sequence, identity__longest_wait_s=0), run(from_the_start(sequence))
     names = [rows_of(each.graph, each.values).keys() for each in (estimator, known)]
@@ -383,7 +383,7 @@ def test_a_wrong_identity_that_is_not_taken_back_leaves_another_graph():
 
 
 def test_an_earlier_sighting_becomes_the_one_that_a_landmark_begins_with():
-    """Seen first without a track, then known to have been seen before: what is said once is said there."""
+    """Seen first without a track, then known to have been seen before: the earlier sighting has the direction."""
     dive = Dive()
     see(dive, 0.0, FLAT, track=4)
     see(dive, 0.5, SURE[5], track=-1)

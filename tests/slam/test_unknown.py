@@ -259,7 +259,7 @@ def nearest(
         for stamp_ns in frames[i]:
             noise = np.diag([NOISE_M**2, (NOISE_M / 2) ** 2])
             sighting = Sighting(stamp_ns, 0, Sightline(X(0), gtsam.Pose3(), np.array([range_m, 0.0])), noise, None)
-            landmarks._put(sighting, ids[i], None)
+            landmarks._insert(sighting, ids[i], None)
         if i in rooted:
             landmarks._rooted[ids[i]] = sighting
     joint = JointCovariance(cov, {L(ids[i]): 3 * k for k, i in enumerate(points)})

@@ -1,47 +1,49 @@
-"""Landmarks of the graph, their sightings, and the life of a detection: one owner, one writer.
+"""Landmarks of the graph, the states of detections, and the decisions that change them.
 
-A policy says what sightings are to become (`Assignment`); `LandmarkGraph.apply` alone changes their state, their
-factors and the journal::
+A policy decides what becomes of sightings (`Decision`). `LandmarkGraph.apply` alone changes their states, their factors
+and the journal::
 
     not judged ──► used, new, reassigned                in the graph at the next update
                ──► waiting ──► used later, placed later, new; forgotten, no identity
                ──► gated, repeated, unfit, waiting      not in the graph
-    in the graph ──► taken back, moved, reassigned, used later, unfit, withheld
-    taken back ──► moved, gated, repeated
+    in the graph ──► retracted (TAKEN_BACK), moved, reassigned, used later, unfit, withheld
+    retracted ──► moved, gated, repeated
     gated, repeated, withheld ──► waiting               their track is of another landmark now
     unfit, withheld ──► used later, reassigned          their place fits now
 
-The earliest sighting of a landmark carries what is said of it once (`SightingFactors`): whatever is put in and taken
-out, in whatever order, the graph depends only on which sightings are of which landmark (docs/theory/identities.md).
+The earliest sighting of a landmark has the factors that a landmark has once (`SightingFactors`). Hence the graph
+depends only on which sightings are of which landmark, and not on the order of changes (docs/theory/identities.md).
 """
 
 from __future__ import annotations
 
 from array import array
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Set
+from collections.abc import Iterable, Set
 from copy import deepcopy
-from typing import NamedTuple, Protocol
+from dataclasses import dataclass
+from typing import NamedTuple
 
+import gtsam
 from gtsam.symbol_shorthand import L
 
 from sonar_graph.measurements import Floats, LandmarkDetections
 from sonar_graph.slam.estimates import Solution
-from sonar_graph.slam.landmarks.sighting import Screened, SeenFrame, Sighting, SightingFactors
+from sonar_graph.slam.landmarks.sighting import Frame, SeenFrame, Sighting, SightingFactors
 from sonar_graph.slam.smoother import Changed, FactorGroup, Smoother
-from sonar_graph.states import OUTCOME_NUMBERS, UNKNOWN, DetectionJournal, Outcome
+from sonar_graph.states import OUTCOME_NUMBERS, UNKNOWN, DetectionJournal, DetectionLog, Outcome
 
 IN_GRAPH = frozenset(
     {Outcome.USED, Outcome.NEW, Outcome.USED_LATER, Outcome.PLACED_LATER, Outcome.MOVED, Outcome.REASSIGNED}
 )
 """States of a sighting whose factors are in the graph."""
 FITTING = frozenset({Outcome.USED_LATER, Outcome.REASSIGNED, Outcome.UNFIT})
+GIVEN_UP = frozenset({Outcome.FORGOTTEN, Outcome.NO_IDENTITY})
 LATER: dict[Outcome | None, frozenset[Outcome]] = {
-    None: frozenset({*IN_GRAPH, Outcome.GATED, Outcome.REPEATED, Outcome.UNFIT, Outcome.WAITING}),
-    Outcome.WAITING: frozenset(
-        {Outcome.USED_LATER, Outcome.PLACED_LATER, Outcome.NEW, Outcome.GATED, Outcome.REPEATED, Outcome.FORGOTTEN}
-        | {Outcome.NO_IDENTITY}
-    ),
+    None: frozenset({Outcome.USED, Outcome.NEW, Outcome.REASSIGNED, Outcome.GATED, Outcome.REPEATED})
+    | {Outcome.UNFIT, Outcome.WAITING},
+    Outcome.WAITING: GIVEN_UP
+    | {Outcome.USED_LATER, Outcome.PLACED_LATER, Outcome.NEW, Outcome.GATED, Outcome.REPEATED},
     **dict.fromkeys(IN_GRAPH, FITTING | {Outcome.TAKEN_BACK, Outcome.MOVED, Outcome.WITHHELD}),
     Outcome.TAKEN_BACK: frozenset({Outcome.MOVED, Outcome.GATED, Outcome.REPEATED}),
     Outcome.GATED: frozenset({Outcome.WAITING}),
@@ -49,7 +51,7 @@ LATER: dict[Outcome | None, frozenset[Outcome]] = {
     Outcome.WITHHELD: FITTING | {Outcome.WAITING, Outcome.TAKEN_BACK},
     Outcome.UNFIT: FITTING,
 }
-"""States that may follow a state; None: not judged yet. From those that are not named here nothing follows."""
+"""States that may follow a state; None: not judged yet. A state that is not a key is final."""
 
 
 class Assignment(NamedTuple):
@@ -58,37 +60,98 @@ class Assignment(NamedTuple):
     sighting: Sighting
     outcome: Outcome
     landmark_id: int | None = None
-    """Landmark that it becomes a sighting of, or for which it was refused; None: the journal keeps what it says."""
+    """Landmark that it becomes a sighting of, or for which it was refused; None: as before in the journal."""
     innovation: Floats | None = None
-    """Shape (2,); None: nothing was expected."""
+    """Shape (2,); None without a prediction."""
     S: Floats | None = None
     """Its covariance, shape (2, 2)."""
     gain: float = 0.0
-    """Expected variance over that of the noise."""
+    """Ratio of expected variance to noise variance: the information that the sighting adds."""
     start: Floats | None = None
     """First estimate of a landmark that begins with it, shape (3,); None: where the sighting places it."""
 
 
-class IdentityPolicy(Protocol):
-    """Decides of which landmarks sightings are."""
+@dataclass(frozen=True)
+class Decision:
+    """What becomes of sightings: rounds of assignments, each applied before the next, with an update between them."""
 
-    def screen(self, frame: LandmarkDetections) -> Screened:
-        """Judge rows by what is said of them alone."""
+    rounds: tuple[tuple[Assignment, ...], ...] = ()
+    settles: bool = False
+    """True: before all rounds, add what waits to the estimate and iterate it to convergence."""
 
-    def assign(self, frame: SeenFrame) -> Iterator[list[Assignment]]:
-        """Rounds of assignments, of a frame's sightings and of earlier ones.
+    @classmethod
+    def of(cls, assignments: Iterable[Assignment]) -> Decision:
+        """Decision of one round, or of none without assignments."""
+        one_round = tuple(assignments)
+        return cls((one_round,)) if one_round else UNCHANGED
 
-        Each round is applied, and the estimate brought up to date if that is due, before the next is asked for.
-        """
+    @property
+    def assignments(self) -> list[Assignment]:
+        """All rounds together."""
+        return [each for one_round in self.rounds for each in one_round]
 
-    def forget(self, now_ns: int, left: Set[int] = frozenset()) -> list[Assignment]:
-        """Give up what has waited too long, and what was seen from poses that leave a bounded window."""
+    @property
+    def is_empty(self) -> bool:
+        """True when nothing changes."""
+        return not self.rounds and not self.settles
+
+
+UNCHANGED = Decision()
+
+
+class IdentityPolicy:
+    """Decides of which landmarks sightings are.
+
+    For each frame `Frontend` calls `retract`, `associate`, `rivals` and `judge` in this order, then `reconsider` until
+    its decision is empty. It applies each decision, and updates the estimate if that is due, before the next call.
+    Without detections for the policy (None) only `retract` and `associate` are called. A method that a policy does not
+    define decides nothing.
+    """
+
+    def __init__(self, landmarks: LandmarkGraph) -> None:
+        self.landmarks = landmarks
+        self.smoother = landmarks.smoother
+
+    def screen(self, frame: LandmarkDetections) -> list[Outcome | None]:
+        """Refuse rows by their identities and tracks alone; None: the row stays."""
+        raise NotImplementedError
+
+    def retract(self, frame: Frame | None) -> Decision:  # noqa: ARG002
+        """Retract earlier sightings whose identity this frame changes."""
+        return UNCHANGED
+
+    def associate(self, frame: Frame | None) -> Decision:  # noqa: ARG002
+        """Associate earlier sightings whose identity this frame reveals."""
+        return UNCHANGED
+
+    def rivals(self, frame: Frame, world_T_sonar: gtsam.Pose3) -> list[int]:
+        """Keys of the variables with which the frame's detections are compared."""
+        raise NotImplementedError
+
+    def judge(self, seen: SeenFrame) -> Decision:
+        """Decide on the frame's detections."""
+        raise NotImplementedError
+
+    def held(self) -> dict[int, float]:
+        """Keyframes to keep in the window because sightings wait on them, with the time until which (s)."""
+        return {}
+
+    def reconsider(self) -> Decision:
+        """Decide on earlier sightings again, after the frame has changed the estimate."""
+        return UNCHANGED
+
+    def forget(self, now_ns: int, left: Set[int] = frozenset()) -> list[Assignment]:  # noqa: ARG002
+        """Give up sightings that have waited too long, or whose keyframes leave a bounded window."""
+        return []
 
     def smoothed(self) -> Solution:
         """Solution of the whole graph."""
+        values, marginals = self.smoother.solve_history()
+        return Solution(values, marginals, self.landmarks.ids)
 
     def rechosen(self) -> list[Assignment]:
-        """Assignments of that solution that the run itself does not make."""
+        """Assignments of that solution that differ from those of the run."""
+        return []
 
 
 class AmendableJournal(DetectionJournal):
@@ -99,44 +162,57 @@ class AmendableJournal(DetectionJournal):
         count = 0
         while count < len(self) and self._stamps_ns[count] < stamp_ns:
             count += 1
-        del self._stamps_ns[:count], self._ids[:count], self._outcomes[:count]
-        del self._innovations[: 2 * count], self._innovation_covs[: 4 * count]
+        del self._stamps_ns[:count]
+        del self._ids[:count]
+        del self._outcomes[:count]
+        del self._innovations[: 2 * count]
+        del self._innovation_covs[: 4 * count]
         self._forgotten += count
 
-    def copy(self) -> AmendableJournal:
-        """Independent copy."""
-        return deepcopy(self)
+    def amend(self, changed: Assignment) -> None:
+        """Change the outcome of a row, and its landmark unless None.
 
-    def amend(
-        self,
-        row: int,
-        outcome: Outcome,
-        landmark_id: int | None = None,
-        innovation: Floats | None = None,
-        innovation_cov: Floats | None = None,
-    ) -> None:
-        """Change the outcome of a row, and its landmark unless None; innovation and covariance as in `record`.
-
-        An earlier innovation is dropped: it was against the landmark that the detection was first taken for.
+        The innovation is replaced too, by NaN if there is none: the earlier one was against another landmark.
         """
-        row -= self._forgotten
+        row = changed.sighting.row - self._forgotten
         if row < 0:
             return
-        self._outcomes[row] = OUTCOME_NUMBERS[outcome]
-        self._ids[row] = self._ids[row] if landmark_id is None else landmark_id
-        e = UNKNOWN[:2] if innovation is None else innovation.tolist()
-        S = UNKNOWN if innovation_cov is None else innovation_cov.ravel().tolist()
+        self._outcomes[row] = OUTCOME_NUMBERS[changed.outcome]
+        if changed.landmark_id is not None:
+            self._ids[row] = changed.landmark_id
+        # an innovation was against the landmark of the earlier outcome
+        e = UNKNOWN[:2] if changed.innovation is None else changed.innovation.tolist()
+        S = UNKNOWN if changed.S is None else changed.S.ravel().tolist()
         self._innovations[2 * row : 2 * row + 2] = array("d", e)
         self._innovation_covs[4 * row : 4 * row + 4] = array("d", S)
 
 
+class State(NamedTuple):
+    """What has become of a sighting so far."""
+
+    outcome: Outcome | None = None
+    """None: not judged yet."""
+    landmark_id: int | None = None
+    """Landmark of which it is a sighting; None where it is not in the graph."""
+    handle: int | None = None
+    """Handle of its factors in the smoother; None where they wait for one, or it is not in the graph."""
+
+
+UNJUDGED = State()
+
+
 class LandmarkGraph:
-    """Sightings that are in the graph, by landmark, and the journal of all detections."""
+    """Sightings with their states and landmarks, and the journal of all detections."""
 
     def __init__(self, smoother: Smoother, factors: SightingFactors, journal: AmendableJournal) -> None:
-        self.smoother, self.factors, self.journal = smoother, factors, journal
+        self.smoother = smoother
+        self.factors = factors
+        self.journal = journal
+        self._states: dict[Sighting, State] = {}
         self._of: dict[int, dict[Sighting, None]] = defaultdict(dict)
+        """Sightings of each landmark, in the order in which they came."""
         self._rooted: dict[int, Sighting] = {}
+        """A sighting that has left a bounded window, of each landmark that has one."""
 
     @property
     def ids(self) -> list[int]:
@@ -146,8 +222,12 @@ class LandmarkGraph:
     def __contains__(self, landmark_id: object) -> bool:
         return landmark_id in self._of
 
+    def state(self, sighting: Sighting) -> State:
+        """State of a sighting, as long as it may change."""
+        return self._states.get(sighting, UNJUDGED)
+
     def sightings(self, landmark_id: int) -> list[Sighting]:
-        """Sightings of a landmark that can be taken back."""
+        """Sightings of a landmark that can be retracted."""
         return list(self._of.get(landmark_id, {}))
 
     def any_sighting(self, landmark_id: int) -> Sighting:
@@ -159,135 +239,151 @@ class LandmarkGraph:
         return landmark_id in self._rooted
 
     def sizes(self) -> dict[int, int]:
-        """Number of sightings of each landmark; those that are in the graph for good count as one."""
+        """Number of sightings of each landmark; all that have left a bounded window count as one."""
         return {i: len(sightings) + (i in self._rooted) for i, sightings in self._of.items()}
 
     def stamps_ns(self, landmark_id: int) -> set[int]:
         """Stamps of the frames that show a landmark."""
         return {sighting.stamp_ns for sighting in self._of.get(landmark_id, {})}
 
+    def settle(self, time_s: float) -> None:
+        """Add the factors that wait to the estimate, and iterate it to convergence."""
+        self.follow(self.smoother.flush(time_s))
+        self.smoother.settle(time_s)
+
     def apply(self, assignments: Iterable[Assignment], time_s: float) -> None:
         """Change the states of sightings, and with them journal and graph.
 
-        Factors of sightings that are judged for the first time are used at the next update, others in one update now.
+        Factors of sightings that are judged for the first time enter at the next update. All others are exchanged now.
         """
-        prompt: list[Assignment] = []
-        leaving: list[Sighting] = []
-        coming: list[tuple[Sighting, int]] = []
+        added: list[Assignment] = []
+        retracted: list[Sighting] = []
+        associated: list[tuple[Sighting, int]] = []
         for each in assignments:
-            sighting, outcome, landmark_id = each.sighting, each.outcome, each.landmark_id
-            if outcome not in LATER.get(sighting.outcome, ()):
-                raise AssertionError(f"a sighting that is {sighting.outcome!r} cannot become {outcome!r}")
-            self.journal.amend(sighting.row, outcome, landmark_id, each.innovation, each.S)
-            if sighting.landmark_id is not None:
-                leaving.append(sighting)
-            if outcome in IN_GRAPH and landmark_id is not None:
-                if sighting.outcome is None:
-                    prompt.append(each)
+            state = self.state(each.sighting)
+            if each.outcome not in LATER.get(state.outcome, ()):
+                raise AssertionError(f"a sighting that is {state.outcome!r} cannot become {each.outcome!r}")
+            self.journal.amend(each)
+            if state.landmark_id is not None:
+                retracted.append(each.sighting)
+            if each.outcome in IN_GRAPH and each.landmark_id is not None:
+                if state.outcome is None:
+                    added.append(each)
                 else:
-                    coming.append((sighting, landmark_id))
-            sighting.outcome = outcome
-        for each in prompt:
+                    associated.append((each.sighting, each.landmark_id))
+            self._states[each.sighting] = state._replace(outcome=each.outcome)
+            if each.outcome not in LATER:
+                del self._states[each.sighting]
+        for each in added:
             self._add(each)
-        if leaving or coming:
-            self._exchange(leaving, coming, time_s)
+        if retracted or associated:
+            self._exchange(retracted, associated, time_s)
 
-    def rechosen(self, assignments: list[Assignment]) -> AmendableJournal:
-        """Copy of the journal as other assignments would have it; nothing else changes."""
-        journal = self.journal.copy() if assignments else self.journal
-        for sighting, outcome, landmark_id, *_ in assignments:
-            journal.amend(sighting.row, outcome, landmark_id)
-        return journal
+    def log(self, rechosen: list[Assignment]) -> DetectionLog:
+        """Outcomes of all detections, with other assignments for some; nothing else changes."""
+        if not rechosen:
+            return self.journal.log()
+        journal = deepcopy(self.journal)
+        for each in rechosen:
+            journal.amend(each)
+        return journal.log()
 
     def follow(self, changed: Changed) -> None:
-        """Take out sightings that the smoother could not use, and let go of those from poses that left.
+        """Update states after the smoother has withheld factors, or poses have left a bounded window.
 
-        What was seen from poses that left a bounded window is part of the graph for good: its landmark stays, whatever
-        becomes of its other sightings, and none of those becomes its first.
+        Sightings from poses that left are part of the graph for good. Their landmark stays, whatever becomes of its
+        other sightings, and none of the others becomes its first.
         """
         if not (changed.withheld or changed.left):
-            return  # as after most updates; what follows looks at every sighting of the run
-        for sighting in [s for sightings in self._of.values() for s in sightings if s.handle in changed.withheld]:
-            self._take(sighting)
-            sighting.outcome = Outcome.WITHHELD
-            self.journal.amend(sighting.row, Outcome.WITHHELD)
-        for landmark, sightings in self._of.items():
+            return  # the usual case; the loops below visit every sighting of the run
+        withheld = [s for s, state in self._states.items() if state.handle in changed.withheld]
+        for sighting in withheld:
+            self._remove(sighting)
+            self._states[sighting] = State(Outcome.WITHHELD)
+            self.journal.amend(Assignment(sighting, Outcome.WITHHELD))
+        for landmark_id, sightings in self._of.items():
+            # their factors are in a marginal now and cannot be taken out
             for sighting in [s for s in sightings if s.line.pose_key in changed.left]:
-                self._rooted.setdefault(landmark, sighting)
+                self._rooted.setdefault(landmark_id, sighting)
                 del sightings[sighting]
+
+    def forget(self, left: Set[int]) -> None:
+        """Drop the states of sightings whose keyframes have left a bounded window."""
+        for sighting in [s for s in self._states if s.line.pose_key in left]:
+            del self._states[sighting]
 
     def _add(self, new: Assignment) -> None:
         """Add a sighting, and its landmark where it is new, at the next update."""
-        sighting, landmark_id = new.sighting, new.landmark_id
-        assert landmark_id is not None
-        is_first = landmark_id not in self
+        assert new.landmark_id is not None
+        key = L(new.landmark_id)
+        is_first = new.landmark_id not in self
         if is_first:
-            start = self.factors.place(sighting, self.smoother.estimates) if new.start is None else new.start
-            self.smoother.add_landmark(L(landmark_id), start)
-        made = self.factors.make(sighting, L(landmark_id), is_first=is_first)
-        handle = self.smoother.add(made, (L(landmark_id), sighting.line), gain=new.gain)
-        self._put(sighting, landmark_id, handle)
+            start = self.factors.start(new.sighting, self.smoother.estimates) if new.start is None else new.start
+            self.smoother.add_landmark(key, start)
+        made = self.factors.make(new.sighting, key, is_first=is_first)
+        handle = self.smoother.add(made, (key, new.sighting.line), gain=new.gain)
+        self._insert(new.sighting, new.landmark_id, handle)
 
-    def _exchange(self, leaving: list[Sighting], coming: list[tuple[Sighting, int]], time_s: float) -> None:
+    def _exchange(self, retracted: list[Sighting], associated: list[tuple[Sighting, int]], time_s: float) -> None:
         """Take sightings out of the graph, and put others in, each for a landmark, in one update of the smoother.
 
-        Where the earliest sighting of a landmark changes, the factors of the old and of the new one are made anew. A
-        landmark that loses its last sighting leaves the graph.
+        A landmark begins with its first sighting and leaves the graph with its last.
         """
         self.follow(self.smoother.flush(time_s))
-        out = [sighting for sighting in leaving if sighting.landmark_id is not None]
-        touched = {s.landmark_id for s in out if s.landmark_id is not None} | {landmark for _, landmark in coming}
-        before = {landmark: self._first(landmark) for landmark in touched}
-        removed = [sighting.handle for sighting in out]
-        for sighting in out:
-            self._take(sighting)
-        for sighting, landmark in coming:
-            self._put(sighting, landmark, None)
-        firsts = {landmark: self._first(landmark) for landmark in before}
-        fresh = {sighting for sighting, _ in coming}
-        again = [  # they stay in, but no longer are, or now are, the first of their landmark
-            s
-            for landmark, old in before.items()
-            if firsts[landmark] is not old
-            for s in (old, firsts[landmark])
-            if s is not None and s.landmark_id == landmark and s not in fresh
-        ]
-        removed += [sighting.handle for sighting in again]
-        begun = {
-            L(landmark): self.factors.place(first, self.smoother.estimates)
-            for landmark, first in firsts.items()
-            if first is not None and before[landmark] is None
+        old_of: dict[Sighting, int] = {}
+        for sighting in retracted:
+            landmark_id = self.state(sighting).landmark_id
+            if landmark_id is not None:  # the flush may have withheld it
+                old_of[sighting] = landmark_id
+        new_of = dict(associated)
+        first_before = {i: self._first(i) for i in sorted({*old_of.values(), *new_of.values()})}
+        removed = [self.state(sighting).handle for sighting in old_of]
+        for sighting in old_of:
+            self._remove(sighting)
+        for sighting, new_id in new_of.items():
+            self._insert(sighting, new_id, None)
+        first = {i: self._first(i) for i in first_before}
+        # a sighting that becomes the first of its landmark, or no longer is, gets other factors
+        remade = {
+            s: i
+            for i, before in first_before.items()
+            if first[i] is not before
+            for s in (before, first[i])
+            if s is not None and s not in new_of and self.state(s).landmark_id == i
         }
-        lost = [L(landmark) for landmark, first in firsts.items() if first is None and before[landmark] is not None]
-        sightings = [sighting for sighting, _ in coming] + again
-        made = [
-            FactorGroup(
-                self.factors.make(s, L(s.landmark_id), is_first=s is firsts[s.landmark_id]), (L(s.landmark_id), s.line)
-            )
-            for s in sightings
-            if s.landmark_id is not None
-        ]
-        changed = self.smoother.exchange(
-            time_s, [handle for handle in removed if handle is not None], made, begun, lost
-        )
-        for sighting, handle in zip(sightings, changed.added, strict=True):
-            sighting.handle = handle
+        removed += [self.state(sighting).handle for sighting in remade]
+        made: dict[Sighting, FactorGroup] = {}
+        for sighting, i in (new_of | remade).items():
+            group = self.factors.make(sighting, L(i), is_first=sighting is first[i])
+            made[sighting] = FactorGroup(group, (L(i), sighting.line))
+        begun = {
+            L(i): self.factors.start(s, self.smoother.estimates)
+            for i, s in first.items()
+            if s is not None and first_before[i] is None
+        }
+        # a landmark without sightings would be undetermined
+        lost = [L(i) for i, s in first.items() if s is None and first_before[i] is not None]
+        handles = [handle for handle in removed if handle is not None]
+        changed = self.smoother.exchange(time_s, handles, list(made.values()), begun, lost)
+        for sighting, handle in zip(made, changed.added, strict=True):
+            self._states[sighting] = self._states[sighting]._replace(handle=handle)
         self.follow(changed)
 
     def _first(self, landmark_id: int) -> Sighting | None:
+        """Sighting that has the factors that a landmark has once."""
         if landmark_id in self._rooted:
             return self._rooted[landmark_id]
         return min(self._of.get(landmark_id, {}), key=lambda s: (s.stamp_ns, s.row), default=None)
 
-    def _put(self, sighting: Sighting, landmark_id: int, handle: int | None) -> None:
-        sighting.landmark_id, sighting.handle = landmark_id, handle
+    def _insert(self, sighting: Sighting, landmark_id: int, handle: int | None) -> None:
+        self._states[sighting] = self.state(sighting)._replace(landmark_id=landmark_id, handle=handle)
         self._of[landmark_id][sighting] = None
 
-    def _take(self, sighting: Sighting) -> None:
-        landmark = sighting.landmark_id
-        if landmark is None:
+    def _remove(self, sighting: Sighting) -> None:
+        outcome, landmark_id, _ = self._states[sighting]
+        if landmark_id is None:
             return
-        del self._of[landmark][sighting]
-        if not self._of[landmark] and landmark not in self._rooted:
-            del self._of[landmark]
-        sighting.landmark_id = sighting.handle = None
+        del self._of[landmark_id][sighting]
+        if not self._of[landmark_id] and landmark_id not in self._rooted:
+            del self._of[landmark_id]
+        self._states[sighting] = State(outcome)

@@ -1,9 +1,9 @@
-"""Max-mixture of identities: choices made again as the estimate moves (docs/theory/doubtful_identities.md).
+"""Policy "max-mixture": identities chosen again as the estimate moves (docs/theory/doubtful_identities.md).
 
 A tracked object is all sightings of one track, or one sighting of no track. Its components are the landmarks that it
-may be, and none. The chosen component has its factors in the graph, the others have none; a Gauss-Newton step of that
-graph is one of the max-mixture. After every update the choices of the window are made anew until none changes. For
-smoothed results the choices of the whole history are made anew too, beside the run, which they leave as it is.
+may be, and none (`mixture`). The chosen component has its factors in the graph, the others have none; a Gauss-Newton
+step of that graph is one of the max-mixture. After every update the choices of the window are revised until none
+changes. For smoothed results the choices of the whole history are revised too, beside the run.
 
 When a detection comes, the state is not yet conditioned on it. It is then weighed by its predictive density, with the
 innovation covariance ``S = H P H' + R``: a vehicle that has drifted must not mistake its landmarks for none.
@@ -12,7 +12,6 @@ innovation covariance ``S = H P H' + R``: a vehicle that has drifted must not mi
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Set
 from typing import Annotated, Literal, NamedTuple
 
 import gtsam
@@ -20,10 +19,16 @@ import numpy as np
 from gtsam.symbol_shorthand import L
 from pydantic import Field
 
-from sonar_graph.measurements import NO_TRACK, LandmarkDetections
-from sonar_graph.models import Kernel
+from sonar_graph.measurements import NO_TRACK, NS_PER_S, LandmarkDetections
+from sonar_graph.models import Kernel, locate
 from sonar_graph.slam.estimates import Solution
-from sonar_graph.slam.landmarks.landmark_graph import Assignment, LandmarkGraph
+from sonar_graph.slam.landmarks.landmark_graph import (
+    UNCHANGED,
+    Assignment,
+    Decision,
+    IdentityPolicy,
+    LandmarkGraph,
+)
 from sonar_graph.slam.landmarks.mixture import (
     Choices,
     IdentityPosterior,
@@ -34,16 +39,18 @@ from sonar_graph.slam.landmarks.mixture import (
     each_once,
     supporters_elsewhere,
 )
-from sonar_graph.slam.landmarks.sighting import Screened, SeenFrame, Sighting, beam_point, late_view
-from sonar_graph.slam.landmarks.tracked import NS_PER_S, GatedIdentity, RobustIdentity, second_rows_of_tracks
-from sonar_graph.slam.smoother import Marginals, solve_in_sight
+from sonar_graph.slam.landmarks.sighting import Frame, SeenFrame, Sighting, late_view
+from sonar_graph.slam.landmarks.tracked import GatedIdentity, RobustIdentity, second_rows_of_tracks
+from sonar_graph.slam.smoother import Marginals, Sightline, solve_in_sight
 from sonar_graph.states import Outcome
 from sonar_graph.tagged_sections import tagged
 
-MOST_WINDOW_ROUNDS, MOST_HISTORY_ROUNDS = 3, 10
-"""Times that choices are made anew, after one update and for one smoothed result."""
+MOST_WINDOW_ROUNDS = 3
+"""Times that the choices of the window are revised after one frame."""
+MOST_HISTORY_ROUNDS = 10
+"""Times that the choices of the history are revised for one smoothed result."""
 MOST_OPEN = 200
-"""Number of newest tracked objects that are chosen anew in the window."""
+"""Number of newest tracked objects whose choices are revised in the window."""
 MOST_RIVALS = 50
 """Number of landmarks nearest to a detection among which it is weighed, beside those that it names. The cost of their
 joint covariance grows with the third power of their number."""
@@ -52,7 +59,7 @@ joint covariance grows with the third power of their number."""
 class MixtureIdentity(RecogniserErrors):
     """Choose for each track, or single detection, the landmark, or none, that posterior and place make most probable.
 
-    The choice is made anew in the window as the estimate moves, and in the whole history for smoothed results. Assumes
+    The choice is revised in the window as the estimate moves, and in the whole history for smoothed results. Assumes
     independent errors at the rate `wrong_id_probability`, and an estimate near the truth when it chooses.
 
     Examples
@@ -82,277 +89,344 @@ class ChosenHistory(NamedTuple):
 
     values: gtsam.Values
     marginals: Marginals
-    watches: list[TrackedObject]
+    objects: list[TrackedObject]
     choices: Choices
     """Choice for each tracked object."""
 
 
-class MixtureIdentities:
-    """Policy "max-mixture": keeps the graph in line with the best component of every tracked object."""
+class MixtureIdentities(IdentityPolicy):
+    """Keeps the graph in line with the best component of every tracked object."""
 
     def __init__(self, landmarks: LandmarkGraph, params: MixtureIdentity, kernel: Kernel) -> None:
-        self._landmarks, self._smoother = landmarks, landmarks.smoother
+        super().__init__(landmarks)
         self.mixture = Mixture(params, kernel)
+        self.objects: list[TrackedObject] = []
+        """All tracked objects in the order in which they began."""
         self._longest_wait_ns = round(params.longest_wait_s * NS_PER_S)
         self._tracks: dict[int, TrackedObject] = {}
         self._disputed: set[int] = set()
-        self._chosen: tuple[gtsam.Values, int, ChosenHistory] | None = None
-        self.watches: list[TrackedObject] = []
-        """All tracked objects in the order in which they began."""
+        """Landmarks that an object names and is not taken for."""
+        self._oldest_ns = 0
+        """Stamp from which on sightings wait."""
+        self._round = 0
+        """Number of decisions of `reconsider` since the last frame."""
+        self._open: list[TrackedObject] = []
+        """Objects whose choices `reconsider` revises."""
+        self._solved: tuple[gtsam.Values, int] | None = None
+        """Solution from which the history was chosen, and number of sightings then."""
+        self._history: ChosenHistory | None = None
 
-    def screen(self, frame: LandmarkDetections) -> Screened:
+    def screen(self, frame: LandmarkDetections) -> list[Outcome | None]:
         """Refuse second rows of tracks."""
-        return Screened(second_rows_of_tracks(frame, {}), [False] * len(frame))
+        return second_rows_of_tracks(frame, {})
 
-    def assign(self, frame: SeenFrame) -> Iterator[list[Assignment]]:
-        """The frame's sightings, with what waited in their tracks; then others as the estimate moves.
+    def rivals(self, frame: Frame, world_T_sonar: gtsam.Pose3) -> list[int]:
+        """Landmarks of the graph, of a large map those near a detection or named; see `MOST_RIVALS`."""
+        ids = self.landmarks.ids
+        if len(ids) > MOST_RIVALS:
+            seen = np.array([locate(world_T_sonar, r, a, 0.0)[:2] for r, a in frame.z.tolist()])
+            points = np.array([self.smoother.estimates.atPoint3(L(i))[:2] for i in ids])
+            distance_m = np.linalg.norm(points - seen[:, None], axis=2)  # (m, K)
+            nearest = np.argpartition(distance_m, MOST_RIVALS - 1, axis=1)[:, :MOST_RIVALS]
+            kept: set[int | None] = {ids[k] for k in np.unique(nearest).tolist()}
+            kept.update(*(IdentityPosterior.of(frame.detections, row).probability for row in range(len(frame))))
+            kept.update(map(self.landmark_of, self._tracks.values()))
+            ids = [i for i in ids if i in kept]
+        return [L(i) for i in ids]
 
-        The detection of a known track is of its landmark. Tracks that are over are forgotten; keyframes on which
-        sightings of others wait are held in the window.
+    def judge(self, seen: SeenFrame) -> Decision:
+        """Choose a landmark for each detection, and for what waited in its track.
+
+        The detection of a known track is of its landmark. Tracks that are over are forgotten.
         """
-        rows, tracks = list(range(len(frame.rows))), frame.detections.track.tolist()
-        statements = [IdentityPosterior.of(frame.detections, row) for row in rows]
-        ids = self._rivals(frame, statements)
-        keys = [L(i) for i in ids]
-        view = frame.predict(keys)
-        points = np.array([self._smoother.estimates.atPoint3(key) for key in keys]).reshape(-1, 3)
-        expected, cov = view.expect(keys, points)
+        frame = seen.frame
+        rows = list(range(len(frame)))
+        tracks = frame.detections.track.tolist()
+        posteriors = [IdentityPosterior.of(frame.detections, row) for row in rows]
+        ids = [gtsam.Symbol(key).index() for key in seen.keys]
+        points = np.array([self.smoother.estimates.atPoint3(key) for key in seen.keys]).reshape(-1, 3)
+        expected, S_0 = seen.view.expect(seen.keys, points)
+        # all components of each detection, before the state is conditioned on it
         scores: list[Scores] = []
-        for row, said in enumerate(statements):
+        for row in rows:
             known = self._tracks.get(tracks[row])
-            if known is not None and known.landmark_id is not None:
-                scores.append({known.landmark_id: np.inf})
+            landmark_id = None if known is None else self.landmark_of(known)
+            if landmark_id is not None:  # a track is of one landmark
+                scores.append({landmark_id: np.inf})
             else:
-                scores.append(self.mixture.at_first(said, ids, frame.z[row], expected, cov + frame.noise[row]))
-        chosen = each_once(scores, [{0}] * len(scores))
-        assigned: list[Assignment] = []
-        for row, sighting in enumerate(frame.sightings(view, rows)):
-            assigned += self._enter(statements[row], tracks[row], sighting, chosen[row])
-        yield assigned
-        oldest_ns = frame.stamp_ns - self._longest_wait_ns
-        self._tracks = {k: watch for k, watch in self._tracks.items() if watch.sightings[-1].stamp_ns >= oldest_ns}
-        self._smoother.hold(
-            {
-                sighting.line.pose_key: (sighting.stamp_ns + self._longest_wait_ns) / NS_PER_S
-                for watch in self._tracks.values()
-                if watch.landmark_id is None
-                for sighting in watch.sightings
-                if sighting.stamp_ns >= oldest_ns
-            }
-        )
-        yield from self.reconsider(frame.keyframes.newest_s)
+                S = S_0 + frame.noise[row]
+                scores.append(self.mixture.at_first(posteriors[row], ids, frame.z[row], expected, S))
+        chosen = each_once(scores, [{frame.stamp_ns}] * len(frame))
+        judged: list[Assignment] = []
+        for row, sighting in enumerate(seen.sightings(rows, seen.beam_points(rows))):
+            each = self._tracked(tracks[row], posteriors[row])
+            judged += self._extended(each, sighting, chosen[row])
+        self._oldest_ns = frame.stamp_ns - self._longest_wait_ns
+        self._tracks = {k: each for k, each in self._tracks.items() if each.sightings[-1].stamp_ns >= self._oldest_ns}
+        self._round = 0
+        return Decision.of(judged)
 
-    def _enter(
-        self, said: IdentityPosterior, track: int, sighting: Sighting, chosen: int | None
-    ) -> Iterator[Assignment]:
-        """One sighting as chosen, and what waited in its track."""
-        watch = self._tracks.get(track)
-        if watch is None:
-            watch = TrackedObject(said)
-            self.watches.append(watch)
-            if track != NO_TRACK:
-                self._tracks[track] = watch
-        waiting = [s for s in watch.sightings if s.outcome is Outcome.UNFIT]
-        watch.statement = said
-        watch.sightings.append(sighting)
-        if said.favourite not in (None, chosen):
-            self._disputed.add(said.favourite)
-        if chosen is None:
-            yield Assignment(sighting, Outcome.UNFIT, -1 if said.favourite is None else said.favourite)
-            return
-        at_once = Outcome.USED if chosen in self._landmarks else Outcome.NEW
-        is_as_said = at_once is Outcome.NEW or chosen == said.favourite
-        yield Assignment(sighting, at_once if is_as_said else Outcome.REASSIGNED, chosen)
-        taken_ns = self._landmarks.stamps_ns(chosen) | {sighting.stamp_ns}
-        yield from (Assignment(s, *late_outcome(said, chosen)) for s in waiting if s.stamp_ns not in taken_ns)
+    def held(self) -> dict[int, float]:
+        """Keyframes of sightings of tracks that are of no landmark yet."""
+        return {
+            sighting.line.pose_key: (sighting.stamp_ns + self._longest_wait_ns) / NS_PER_S
+            for each in self._tracks.values()
+            if self.landmark_of(each) is None
+            for sighting in each.sightings
+            if sighting.stamp_ns >= self._oldest_ns
+        }
 
-    def reconsider(self, now_s: float) -> Iterator[list[Assignment]]:
-        """Choose anew in the window until nothing changes; move landmarks to where their sightings agree."""
-        watches = self._open()
-        if self._changes(watches):
-            self._landmarks.follow(self._smoother.flush(now_s))
-            self._smoother.settle(now_s)  # a step of a robust kernel may end far from where the choices are to be made
-        for _ in range(MOST_WINDOW_ROUNDS):
-            changes = [
-                (watch, new)
-                for watch, new in self._changes(watches)
-                if watch.landmark_id is None or self._is_alone(watch) or self._is_preferred(new, watch)
-            ]
-            if not changes:
-                break
-            yield self._change(changes)
-        for landmark_id in sorted(self._disputed.intersection(self._landmarks.ids)):
-            naming = [watch for watch in self.watches if watch.statement.favourite == landmark_id]
-            present = [watch.landmark_id for watch in naming]
-            found = supporters_elsewhere(landmark_id, naming, present, self._smoother.estimates, self.mixture)
-            if found is not None:
-                yield self._change([(w, None) for w in self.watches if w.landmark_id == landmark_id])
-                yield self._change([(w, landmark_id) for w in found])
-        self._disputed.clear()
-
-    def forget(self, now_ns: int, left: Set[int] = frozenset()) -> list[Assignment]:  # noqa: ARG002
-        """Nothing is forgotten: it may be chosen anew in the whole history."""
-        return []
+    def reconsider(self) -> Decision:
+        """Revise the choices of the window until none changes; then move landmarks to where their sightings agree."""
+        self._round += 1
+        if self._round == 1:
+            self._open = self._revisable()
+            if self._changes(self._open):
+                # a step of a robust kernel may end far from the minimum at which the choices are to be revised
+                return Decision(settles=True)
+            self._open = []
+        if self._round <= 1 + MOST_WINDOW_ROUNDS and self._open:
+            changes = [(each, new) for each, new in self._changes(self._open) if self._is_preferred(new, each)]
+            if changes:
+                return Decision.of(self._revised(changes))
+            self._open = []
+        while self._disputed:
+            landmark_id = min(self._disputed)
+            self._disputed.discard(landmark_id)
+            if landmark_id in self.landmarks:
+                relocated = self._relocation(landmark_id)
+                if not relocated.is_empty:
+                    return relocated
+        return UNCHANGED
 
     def smoothed(self) -> Solution:
         """Solution of the whole graph with the choices that suit it best."""
-        chosen = self._history()
+        chosen = self.history()
         return Solution(chosen.values, chosen.marginals, sorted({i for i in chosen.choices if i is not None}))
 
     def rechosen(self) -> list[Assignment]:
-        """Assignments of the whole history that are not those of the window."""
-        chosen = self._history()
-        return _assigned(_differing(chosen.watches, chosen.choices))
+        """Assignments of the whole history that differ from those of the window."""
+        chosen = self.history()
+        return _assigned(self._differing(chosen.objects, chosen.choices))
 
-    def _changes(self, watches: list[TrackedObject]) -> Changes:
-        values, sizes = self._smoother.estimates, self._landmarks.sizes()
-        return _differing(watches, self.mixture.best(watches, values, [w.landmark_id for w in watches], sizes))
+    def landmark_of(self, each: TrackedObject) -> int | None:
+        """Landmark that a tracked object counts as; None: no landmark."""
+        for sighting in each.sightings:
+            landmark_id = self.landmarks.state(sighting).landmark_id
+            if landmark_id is not None:
+                return landmark_id
+        return None
 
-    def _change(self, changes: Changes) -> list[Assignment]:
-        self._disputed |= {w.statement.favourite for w, new in changes if w.statement.favourite not in (None, new)}
+    def _tracked(self, track: int, posterior: IdentityPosterior) -> TrackedObject:
+        """Object of a track, or a new one, with its newest posterior."""
+        each = self._tracks.get(track)
+        if each is None:
+            each = TrackedObject(posterior)
+            self.objects.append(each)
+            if track != NO_TRACK:
+                self._tracks[track] = each
+        each.posterior = posterior
+        return each
+
+    def _extended(self, each: TrackedObject, sighting: Sighting, chosen: int | None) -> list[Assignment]:
+        """Extend a tracked object by a sighting as chosen; what waited in its track follows."""
+        waiting = [s for s in each.sightings if self.landmarks.state(s).outcome is Outcome.UNFIT]
+        each.sightings.append(sighting)
+        favourite = each.posterior.favourite
+        self._dispute([(each, chosen)])
+        if chosen is None:
+            return [Assignment(sighting, Outcome.UNFIT, -1 if favourite is None else favourite)]
+        outcome = Outcome.USED if chosen == favourite else Outcome.REASSIGNED
+        if chosen not in self.landmarks:
+            outcome = Outcome.NEW
+        # a landmark is once in a frame
+        taken_ns = self.landmarks.stamps_ns(chosen) | {sighting.stamp_ns}
+        free = [s for s in waiting if s.stamp_ns not in taken_ns]
+        return [Assignment(sighting, outcome, chosen), *(_late(s, each, chosen) for s in free)]
+
+    def _dispute(self, changes: Changes) -> None:
+        """Note the landmarks that objects name and are not taken for."""
+        for each, new in changes:
+            favourite = each.posterior.favourite
+            if favourite is not None and favourite != new:
+                self._disputed.add(favourite)
+
+    def _revised(self, changes: Changes) -> list[Assignment]:
+        self._dispute(changes)
         return _assigned(changes)
 
-    def _open(self) -> list[TrackedObject]:
-        """Objects to choose anew: tracks whose statement contradicts their present choice, and objects in the window.
+    def _changes(self, objects: list[TrackedObject]) -> Changes:
+        """Best components that differ from the present choices."""
+        choices = [self.landmark_of(each) for each in objects]
+        best = self.mixture.best(objects, self.smoother.estimates, choices, self.landmarks.sizes())
+        return self._differing(objects, best)
+
+    def _differing(self, objects: list[TrackedObject], choices: Choices) -> Changes:
+        return [(each, new) for each, new in zip(objects, choices, strict=True) if new != self.landmark_of(each)]
+
+    def _relocation(self, landmark_id: int) -> Decision:
+        """Take a landmark out of the graph, and begin it again where the objects that name it agree that it is."""
+        naming = [each for each in self.objects if each.posterior.favourite == landmark_id]
+        choices = [self.landmark_of(each) for each in naming]
+        supporters = supporters_elsewhere(landmark_id, naming, choices, self.smoother.estimates, self.mixture)
+        if supporters is None:
+            return UNCHANGED
+        leaving = _assigned([(each, None) for each in self.objects if self.landmark_of(each) == landmark_id])
+        coming = _assigned([(each, landmark_id) for each in supporters])
+        # in two rounds: a landmark begins in a new place only after it has lost its last sighting
+        return Decision((tuple(leaving), tuple(coming)))
+
+    def _revisable(self) -> list[TrackedObject]:
+        """Objects whose choices are revised: tracks whose posterior contradicts it, and objects in the window.
 
         An object is in the window when all its sightings are. One that alone holds a landmark keeps it.
         """
-        recent = self.watches[-MOST_OPEN:]
         contradicted = [
-            watch
-            for watch in self._tracks.values()
-            if watch.landmark_id is not None and watch.statement.favourite not in (None, watch.landmark_id)
+            each
+            for each in self._tracks.values()
+            if self.landmark_of(each) is not None
+            and each.posterior.favourite is not None
+            and each.posterior.favourite != self.landmark_of(each)
         ]
-        inside = set(self._smoother.in_window(sorted({s.line.pose_key for w in recent for s in w.sightings})))
+        recent = self.objects[-MOST_OPEN:]
+        inside = set(self.smoother.in_window(sorted({s.line.pose_key for each in recent for s in each.sightings})))
         return contradicted + [
-            watch
-            for watch in recent
-            if not self._is_alone(watch)
-            and all(s.line.pose_key in inside for s in watch.sightings)
-            and watch not in contradicted
+            each
+            for each in recent
+            if each not in contradicted
+            and not self._is_alone(each)
+            and all(s.line.pose_key in inside for s in each.sightings)
         ]
 
-    def _rivals(self, frame: SeenFrame, statements: list[IdentityPosterior]) -> list[int]:
-        """Landmarks among which the detections of a frame are weighed, ascending; see `MOST_RIVALS`."""
-        ids = self._landmarks.ids
-        if len(ids) <= MOST_RIVALS:
-            return ids
-        world_T_sonar = frame.predict([]).world_T_sonar
-        seen = np.array([beam_point(world_T_sonar, z)[:2] for z in frame.z])
-        points = np.array([self._smoother.estimates.atPoint3(L(i))[:2] for i in ids])
-        away_m = np.linalg.norm(points - seen[:, None], axis=2)
-        near = np.argpartition(away_m, MOST_RIVALS - 1, axis=1)[:, :MOST_RIVALS]
-        kept = {ids[k] for k in np.unique(near).tolist()}
-        kept.update(i for statement in statements for i in statement.probability)
-        kept.update(w.landmark_id for w in self._tracks.values() if w.landmark_id is not None)
-        return [i for i in ids if i in kept]
-
-    def _is_alone(self, watch: TrackedObject) -> bool:
+    def _is_alone(self, each: TrackedObject) -> bool:
         """True when no other object has sightings of its landmark."""
-        return watch.landmark_id is not None and self._landmarks.sizes()[watch.landmark_id] == len(watch.sightings)
+        landmark_id = self.landmark_of(each)
+        return landmark_id is not None and self.landmarks.sizes()[landmark_id] == len(each.sightings)
 
-    def _is_preferred(self, new: int | None, watch: TrackedObject) -> bool:
+    def _is_preferred(self, new: int | None, each: TrackedObject) -> bool:
         """True when the predictive density of the newest sighting also prefers the new component to the present one.
 
         While the estimate is uncertain, as when a loop closes, a large residual does not yet mean a wrong identity.
-        With a robust kernel it may stay large for some updates.
+        With a robust kernel it may stay large for some updates. An object of no landmark, or one that alone holds its
+        landmark, may always change.
         """
-        sighting, values = watch.sightings[-1], self._smoother.estimates
-        ids = [i for i in (watch.landmark_id, new) if i is not None and i in self._landmarks]
+        old = self.landmark_of(each)
+        if old is None or self._is_alone(each):
+            return True
+        sighting = each.sightings[-1]
+        values = self.smoother.estimates
+        ids = [i for i in (old, new) if i is not None and i in self.landmarks]
         keys = [L(i) for i in ids]
-        view = late_view(sighting, values, self._smoother.joint_covariance_of_any([sighting.line.pose_key, *keys]))
-        expected, cov = view.expect(keys, np.array([values.atPoint3(key) for key in keys]))
-        scores = self.mixture.at_first(watch.statement, ids, sighting.line.z, expected, cov + sighting.noise)
-        return scores[new] > scores[watch.landmark_id]
+        view = late_view(sighting, values, self.smoother.joint_covariance_of_any([sighting.line.pose_key, *keys]))
+        expected, S_0 = view.expect(keys, np.array([values.atPoint3(key) for key in keys]))
+        scores = self.mixture.at_first(each.posterior, ids, sighting.line.z, expected, S_0 + sighting.noise)
+        return scores[new] > scores[old]
 
-    def _history(self) -> ChosenHistory:
-        """Choose anew in the whole history until nothing changes."""
-        solved, marginals = self._smoother.solve_history()
-        heard = sum(len(watch.sightings) for watch in self.watches)
-        if self._chosen is None or self._chosen[0] is not solved or self._chosen[1] != heard:
-            watches = [
-                watch
-                for watch in self.watches
-                if watch.landmark_id is not None or all(s.outcome is not Outcome.WITHHELD for s in watch.sightings)
-            ]
-            handles = {s.handle for watch in watches for s in watch.sightings if s.handle is not None}
-            rest, values = self._smoother.graph_without(handles), solved
-            choices = [watch.landmark_id for watch in watches]
-            for _ in range(MOST_HISTORY_ROUNDS):
-                start, better = values, self.mixture.best(watches, values, choices, _sizes(watches, choices))
-                if better == choices:
-                    start, better = self._relocated(watches, values, choices)
-                if better == choices:
-                    break
-                values, choices = self._solve(rest, watches, start, better), better
-            if values is not solved:
-                marginals = Marginals(self._graph(rest, watches, choices), values)
-            self._chosen = solved, heard, ChosenHistory(values, marginals, watches, choices)
-        return self._chosen[2]
+    def history(self) -> ChosenHistory:
+        """Revise the choices of the whole history until none changes. The run's own choices stay."""
+        solved, marginals = self.smoother.solve_history()
+        count = sum(len(each.sightings) for each in self.objects)
+        if self._history is None or self._solved is None or self._solved[0] is not solved or self._solved[1] != count:
+            self._history = self._choose_history(solved, marginals)
+            self._solved = (solved, count)
+        return self._history
+
+    def _choose_history(self, solved: gtsam.Values, marginals: Marginals) -> ChosenHistory:
+        objects = [each for each in self.objects if not self._is_withheld(each)]
+        handles = {self.landmarks.state(sighting).handle for each in objects for sighting in each.sightings}
+        rest = self.smoother.graph_without({handle for handle in handles if handle is not None})
+        values = solved
+        choices = [self.landmark_of(each) for each in objects]
+        for _ in range(MOST_HISTORY_ROUNDS):
+            # first the choices at the solution; when they are stable, the places of landmarks
+            start = values
+            better = self.mixture.best(objects, values, choices, _sizes(objects, choices))
+            if better == choices:
+                start, better = self._relocated(objects, values, choices)
+            if better == choices:
+                break
+            values = self.solution(rest, objects, start, better)
+            choices = better
+        if values is not solved:
+            marginals = Marginals(self.graph(rest, objects, choices), values)
+        return ChosenHistory(values, marginals, objects, choices)
+
+    def _is_withheld(self, each: TrackedObject) -> bool:
+        """True when a sighting of an object of no landmark could not be used."""
+        outcomes = [self.landmarks.state(sighting).outcome for sighting in each.sightings]
+        return self.landmark_of(each) is None and Outcome.WITHHELD in outcomes
 
     def _relocated(
-        self, watches: list[TrackedObject], values: gtsam.Values, choices: Choices
+        self, objects: list[TrackedObject], values: gtsam.Values, choices: Choices
     ) -> tuple[gtsam.Values, Choices]:
-        """Landmarks that began with something else begin where those that name them agree that they are."""
+        """Begin landmarks that began with something else where those that name them agree that they are."""
         moved = gtsam.Values(values)
-        for landmark_id in sorted(_sizes(watches, choices)):
-            rows = [row for row, watch in enumerate(watches) if watch.statement.favourite == landmark_id]
-            naming, now = [watches[row] for row in rows], [choices[row] for row in rows]
-            found = supporters_elsewhere(landmark_id, naming, now, values, self.mixture)
-            if found is not None:
-                without = [None if choice == landmark_id else choice for choice in choices]
-                choices = [landmark_id if w in found else c for w, c in zip(watches, without, strict=True)]
-                first = min((s for watch in found for s in watch.sightings), key=lambda s: (s.stamp_ns, s.row))
-                moved.update(L(landmark_id), self._landmarks.factors.place(first, values))
+        for landmark_id in sorted(_sizes(objects, choices)):
+            named = [each.posterior.favourite == landmark_id for each in objects]
+            naming = [each for each, is_named in zip(objects, named, strict=True) if is_named]
+            present = [choice for choice, is_named in zip(choices, named, strict=True) if is_named]
+            supporters = supporters_elsewhere(landmark_id, naming, present, values, self.mixture)
+            if supporters is None:
+                continue
+            without = [None if choice == landmark_id else choice for choice in choices]
+            choices = [
+                landmark_id if each in supporters else choice for each, choice in zip(objects, without, strict=True)
+            ]
+            first = min((s for each in supporters for s in each.sightings), key=_age)
+            moved.update(L(landmark_id), self.landmarks.factors.start(first, values))
         return moved, choices
 
-    def _solve(
-        self, rest: gtsam.NonlinearFactorGraph, watches: list[TrackedObject], values: gtsam.Values, choices: Choices
+    def solution(
+        self, rest: gtsam.NonlinearFactorGraph, objects: list[TrackedObject], values: gtsam.Values, choices: Choices
     ) -> gtsam.Values:
         """Solution of the history in which each tracked object is the landmark chosen for it."""
-        lines, start = defaultdict(list), gtsam.Values(values)
-        for watch, choice in zip(watches, choices, strict=True):
-            if choice is not None:
-                for sighting in watch.sightings:
-                    lines[L(choice)].append(sighting.line)
-                if not start.exists(L(choice)):
-                    start.insert(L(choice), self._landmarks.factors.place(watch.sightings[0], values))
-        return solve_in_sight(self._graph(rest, watches, choices), start, lines)
+        start = gtsam.Values(values)
+        lines: dict[int, list[Sightline]] = defaultdict(list)
+        for each, choice in zip(objects, choices, strict=True):
+            if choice is None:
+                continue
+            lines[L(choice)] += [sighting.line for sighting in each.sightings]
+            if not start.exists(L(choice)):
+                start.insert(L(choice), self.landmarks.factors.start(each.sightings[0], values))
+        return solve_in_sight(self.graph(rest, objects, choices), start, lines)
 
-    def _graph(
-        self, rest: gtsam.NonlinearFactorGraph, watches: list[TrackedObject], choices: Choices
+    def graph(
+        self, rest: gtsam.NonlinearFactorGraph, objects: list[TrackedObject], choices: Choices
     ) -> gtsam.NonlinearFactorGraph:
+        """All factors, those of sightings as chosen."""
         graph = gtsam.NonlinearFactorGraph(rest)
         of: dict[int, list[Sighting]] = defaultdict(list)
-        for watch, landmark_id in zip(watches, choices, strict=True):
-            if landmark_id is not None:
-                of[landmark_id] += watch.sightings
+        for each, choice in zip(objects, choices, strict=True):
+            if choice is not None:
+                of[choice] += each.sightings
         for landmark_id, sightings in of.items():
-            for k, sighting in enumerate(sorted(sightings, key=lambda sighting: (sighting.stamp_ns, sighting.row))):
-                for factor in self._landmarks.factors.make(sighting, L(landmark_id), is_first=k == 0).values():
+            # as in `LandmarkGraph`, the earliest has the factors that a landmark has once
+            for k, sighting in enumerate(sorted(sightings, key=_age)):
+                for factor in self.landmarks.factors.make(sighting, L(landmark_id), is_first=k == 0).values():
                     graph.add(factor)
         return graph
 
 
-def late_outcome(statement: IdentityPosterior, new: int | None) -> tuple[Outcome, int | None]:
-    """Outcome of detections whose landmark is chosen late, and the landmark for the journal."""
+def _late(sighting: Sighting, each: TrackedObject, new: int | None) -> Assignment:
+    """Assignment of a sighting of an object whose landmark is chosen late."""
+    favourite = each.posterior.favourite
     if new is None:
-        return Outcome.UNFIT, statement.favourite
-    return Outcome.USED_LATER if new == statement.favourite else Outcome.REASSIGNED, new
+        return Assignment(sighting, Outcome.UNFIT, favourite)
+    return Assignment(sighting, Outcome.USED_LATER if new == favourite else Outcome.REASSIGNED, new)
 
 
 def _assigned(changes: Changes) -> list[Assignment]:
-    return [Assignment(s, *late_outcome(watch.statement, new)) for watch, new in changes for s in watch.sightings]
+    return [_late(sighting, each, new) for each, new in changes for sighting in each.sightings]
 
 
-def _differing(watches: list[TrackedObject], choices: Choices) -> Changes:
-    return [(watch, new) for watch, new in zip(watches, choices, strict=True) if new != watch.landmark_id]
+def _age(sighting: Sighting) -> tuple[int, int]:
+    return sighting.stamp_ns, sighting.row
 
 
-def _sizes(watches: list[TrackedObject], choices: Choices) -> dict[int, int]:
+def _sizes(objects: list[TrackedObject], choices: Choices) -> dict[int, int]:
     """Number of sightings of each chosen landmark."""
     sizes: dict[int, int] = defaultdict(int)
-    for watch, choice in zip(watches, choices, strict=True):
+    for each, choice in zip(objects, choices, strict=True):
         if choice is not None:
-            sizes[choice] += len(watch.sightings)
+            sizes[choice] += len(each.sightings)
     return sizes

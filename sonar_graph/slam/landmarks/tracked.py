@@ -1,68 +1,45 @@
-"""Identities that are believed track by track, known late, or changed (docs/theory/identities.md).
+"""Policies "robust" (default) and "gate": identities are accepted track by track, late or revised.
 
-Sightings of a track wait, each on the keyframe at which it was made, until the track is known to be of a landmark; then
-all become factors there. When the track turns out to be of another landmark, or of none, its factors are taken out of
-the graph; those of the other landmark are put in once the estimate no longer rests on the wrong ones.
+A row *decides* its track: for a landmark whose posterior reaches `minimum_probability`, or for none. On a decision::
+
+    sightings that wait                  become factors of the landmark, each on the keyframe of its frame
+    sightings of another landmark        are retracted first; with none, all wait
+
+Retraction comes first, in an update of its own: the landmark then begins in the right place. With a gate, a sighting
+has to pass the chi-square test of its innovation, ``e' S^-1 e <= chi2(2)`` (docs/theory/identities.md).
 """
 
 import math
-from collections.abc import Iterator, Mapping, Set
+from collections.abc import Mapping, Set
 from dataclasses import dataclass, field
 from typing import Literal
 
+import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import L
 from pydantic import Field
 
 from sonar_graph.calibration import Section
-from sonar_graph.measurements import NO_TRACK, LandmarkDetections
-from sonar_graph.models import ACCEPTED, MINIMUM_PROBABILITY, gate_threshold, identify
-from sonar_graph.slam.estimates import Solution
-from sonar_graph.slam.landmarks.landmark_graph import Assignment, LandmarkGraph
-from sonar_graph.slam.landmarks.sighting import Screened, SeenFrame, Sighting, beam_point, late_view
-from sonar_graph.slam.landmarks.unknown import IgnoredUnknown, NamelessLandmarks, UnknownParams, unnamed
+from sonar_graph.measurements import NO_TRACK, NS_PER_S, LandmarkDetections
+from sonar_graph.models import ACCEPTED, MINIMUM_PROBABILITY, gate_threshold, identify, locate
+from sonar_graph.slam.landmarks.landmark_graph import (
+    UNCHANGED,
+    Assignment,
+    Decision,
+    IdentityPolicy,
+    LandmarkGraph,
+)
+from sonar_graph.slam.landmarks.sighting import Frame, SeenFrame, Sighting, late_view
+from sonar_graph.slam.landmarks.unknown import IgnoredUnknown, UnknownParams
 from sonar_graph.states import OUTCOMES, Outcome
 
-UNDECIDED, NO_LANDMARK = -2, -1
-"""Decisions of a row besides a landmark's identity."""
-
-
-def decide(frame: LandmarkDetections, least_probability: float) -> list[int]:
-    """Decision of each row: a landmark's identity, `NO_LANDMARK` or `UNDECIDED`."""
-    ids, probability = frame.most_probable()
-    none = 1.0 - frame.id_probability.sum(axis=1)
-    return [
-        landmark_id
-        if p >= least_probability and landmark_id >= 0
-        else (NO_LANDMARK if missing >= least_probability else UNDECIDED)
-        for landmark_id, p, missing in zip(ids.tolist(), probability.tolist(), none.tolist(), strict=True)
-    ]
-
-
-def second_rows_of_tracks(frame: LandmarkDetections, identities: Mapping[int, int]) -> list[Outcome | None]:
-    """Refusals of the rows of a frame that show an object a second time; None: the row stays.
-
-    A track is one object in one place, so each frame keeps one row of it: that with the highest posterior for the
-    landmark that the track counts as, by its number; of others, the one with the highest posterior for any landmark; of
-    equals the first.
-    """
-    tracks = frame.track.tolist()
-    best: dict[int, tuple[float, float, int]] = {}
-    for row, track in enumerate(tracks):
-        if track != NO_TRACK:
-            is_landmark = frame.candidate_ids[row] >= 0
-            ids, posterior = frame.candidate_ids[row, is_landmark], frame.id_probability[row, is_landmark]
-            of_it = float(posterior[ids == identities.get(track, UNDECIDED)].sum())
-            score = of_it, float(posterior.max(initial=0.0)), -row
-            best[track] = max(best.get(track, score), score)
-    return [
-        None if track == NO_TRACK or -best[track][2] == row else Outcome.TRACK_REPEATED
-        for row, track in enumerate(tracks)
-    ]
+UNDECIDED = -2
+NO_LANDMARK = -1
+"""Decisions of a row besides the identity of a landmark."""
 
 
 class TrackedIdentity(Section):
-    """Settings of identities that are believed track by track."""
+    """Settings of identities that are accepted track by track."""
 
     minimum_probability: float = Field(MINIMUM_PROBABILITY, ge=0, le=1)
     """Least posterior of the most probable identity with which a detection is used."""
@@ -75,15 +52,15 @@ class TrackedIdentity(Section):
 
     @property
     def gate(self) -> float:
-        """Largest squared Mahalanobis innovation of range and azimuth; infinite: none is refused."""
+        """Largest squared Mahalanobis distance of range and azimuth; infinite: none is refused."""
         return math.inf
 
 
 class RobustIdentity(TrackedIdentity):
     """Use every detection whose identity is probable enough; the kernel limits the pull of wrong ones.
 
-    Assumes that most sightings of every landmark are right, and that wrong ones disagree with each other: the kernel
-    then lets the majority win, unless a landmark's first sighting is so far off that the others hardly pull.
+    Assumes that most sightings of every landmark are right, and that wrong ones disagree with each other. The kernel
+    then lets the majority win, unless the first sighting of a landmark is so far off that the others hardly pull.
 
     Examples
     --------
@@ -98,7 +75,7 @@ class RobustIdentity(TrackedIdentity):
 class GatedIdentity(TrackedIdentity):
     """Use a detection whose identity is probable enough if it lies inside the gate of that landmark.
 
-    Assumes that the estimate and its covariance are right when a detection comes: a detection outside the gate is
+    Assumes that the estimate and its covariance are right when a detection comes. A detection outside the gate is
     refused, and not tried again unless its track changes its identity. Tracks change theirs as with "robust".
 
     Examples
@@ -110,16 +87,13 @@ class GatedIdentity(TrackedIdentity):
 
     policy: Literal["gate"] = "gate"
     gate_probability: float = Field(0.999, gt=0, le=1)
-    """Probability with which a right detection passes the gate: detections are refused whose squared Mahalanobis
-    innovation exceeds this chi-square quantile (2 dof). 1: no gate."""
+    """Probability with which a right detection passes the gate. A detection is refused when its squared Mahalanobis
+    distance exceeds this chi-square quantile (2 dof). 1: no gate."""
 
     @property
     def gate(self) -> float:
-        """Largest squared Mahalanobis innovation of range and azimuth; infinite: none is refused."""
+        """Largest squared Mahalanobis distance of range and azimuth; infinite: none is refused."""
         return gate_threshold(self.gate_probability, 2) if self.gate_probability < 1 else math.inf
-
-
-NS_PER_S = 1_000_000_000
 
 
 @dataclass(eq=False)
@@ -131,185 +105,273 @@ class Track:
     newest_ns: int = 0
     """Stamp at which it was last seen."""
     waiting: list[Sighting] = field(default_factory=list)
-    """Sightings to be used once their landmark is known."""
+    """Sightings to be used once their landmark is known, in the order of time."""
     settled: list[Sighting] = field(default_factory=list)
     """Sightings used, or refused, as sightings of that landmark."""
 
-    def reopen(self, sightings: list[Sighting]) -> list[Assignment]:
-        """Let settled sightings wait again; those in the graph are taken back."""
-        self.settled = [sighting for sighting in self.settled if sighting not in set(sightings)]
+    def reopen(self, sightings: list[Sighting]) -> None:
+        """Let settled sightings wait again."""
+        reopened = set(sightings)
+        self.settled = [sighting for sighting in self.settled if sighting not in reopened]
         self.waiting = sorted(self.waiting + sightings, key=lambda sighting: sighting.stamp_ns)
-        return [Assignment(s, Outcome.WAITING if s.landmark_id is None else Outcome.TAKEN_BACK) for s in sightings]
 
 
-class TrackedIdentities:
-    """Policies "robust" and "gate": keeps the graph in line with what is said of detections and of their tracks.
+class TrackedIdentities(IdentityPolicy):
+    """Policies "robust" and "gate".
 
-    A sighting waits at most ``longest_wait_s``; a track that was not seen for so long is over, and keeps its identity.
+    A sighting waits at most ``longest_wait_s``. A track that was not seen for so long is over, and keeps its identity.
     """
 
-    def __init__(
-        self, landmarks: LandmarkGraph, params: TrackedIdentity, nameless: NamelessLandmarks | None = None
-    ) -> None:
-        self._landmarks, self._nameless = landmarks, nameless
-        self._gate, self._minimum_probability = params.gate, params.minimum_probability
+    def __init__(self, landmarks: LandmarkGraph, params: TrackedIdentity) -> None:
+        super().__init__(landmarks)
+        self._gate = params.gate
+        self._minimum_probability = params.minimum_probability
         self._longest_wait_ns = round(params.longest_wait_s * NS_PER_S)
         self._tracks: dict[int, Track] = {}
+        self._claims: list[Track] = []
+        """Tracks that this frame decides or gives back their landmark, the most probable first."""
 
-    def screen(self, frame: LandmarkDetections) -> Screened:
-        """Refuse second rows of tracks, and rows of no track whose identity is not probable enough or taken."""
+    def screen(self, frame: LandmarkDetections) -> list[Outcome | None]:
+        """Refuse second rows of tracks, improbable identities, and those that the frame has in a more probable row."""
         oldest_ns = int(frame.stamps_ns[0]) - self._longest_wait_ns
         known = {number: track.identity for number, track in self._tracks.items() if track.newest_ns >= oldest_ns}
-        refusals, waits = second_rows_of_tracks(frame, known), frame.track != NO_TRACK
-        if self._nameless is not None:
-            self._nameless.refuse_taken_ids(frame)
-            waits |= unnamed(frame)
-        kept = [row for row, why in enumerate(refusals) if why is None]
-        seen = frame if len(kept) == len(frame) else frame.rows(np.array(kept))
-        for row, number in zip(kept, identify(seen, self._minimum_probability)[1].tolist(), strict=True):
+        refusals = second_rows_of_tracks(frame, known)
+        # the second rows are left out before a landmark is given to the most probable row of the frame
+        kept = np.array([why is None for why in refusals])
+        _, outcomes = identify(frame if kept.all() else frame.rows(kept), self._minimum_probability)
+        for row, number in zip(np.flatnonzero(kept).tolist(), outcomes.tolist(), strict=True):
             refusals[row] = None if number == ACCEPTED else OUTCOMES[number]
-        return Screened(refusals, [wait and row in kept for row, wait in enumerate(waits.tolist())])
+        return refusals
 
-    def assign(self, frame: SeenFrame) -> Iterator[list[Assignment]]:
-        """Earlier sightings of tracks whose identity changes, then the frame's, those without a name last."""
-        seen = frame.detections
-        nameless = np.flatnonzero(unnamed(seen)).tolist() if self._nameless is not None else []
-        rows, tracks = [row for row in range(len(seen)) if row not in nameless], seen.track.tolist()
-        tracked = [row for row in rows if tracks[row] != NO_TRACK]
-        if tracked:
-            yield from self._hear(seen.rows(np.array(tracked)))
-        sightings: dict[int, Sighting] = {}
-        if rows:
-            assigned = self._judge(frame, rows)
-            sightings = {each.sighting.row: each.sighting for each in assigned}
-            yield assigned
-        if self._nameless is not None:
-            taken = {s.landmark_id for s in sightings.values() if s.landmark_id is not None}
-            yield from self._nameless.assign(frame, nameless, taken)
-        for row in tracked:
-            sighting, track = sightings[frame.rows[row]], self._tracks[tracks[row]]
-            (track.waiting if sighting.outcome is Outcome.WAITING else track.settled).append(sighting)
-        if tracked:  # what may soon be used stays in the window
-            self._landmarks.smoother.hold(
-                {
-                    waiting.line.pose_key: (waiting.stamp_ns + self._longest_wait_ns) / NS_PER_S
-                    for track in self._tracks.values()
-                    if track.identity != NO_LANDMARK
-                    for waiting in track.waiting
-                }
-            )
+    def retract(self, frame: Frame | None) -> Decision:
+        """Give tracks their new identities, and let their sightings of another landmark wait again.
+
+        Sightings that these had displaced wait again too. A sighting is displaced when another track had its landmark
+        in its frame.
+        """
+        self._claims = []
+        tracked = None if frame is None else frame.select(frame.detections.track != NO_TRACK)
+        if tracked is None:
+            return UNCHANGED
+        given_up = self.forget(tracked.stamp_ns)
+        reopened: list[Sighting] = []
+        freed: set[tuple[int, int]] = set()
+        for track, identity in self._decided(tracked):
+            self._claims.append(track)
+            if identity == track.identity:
+                continue
+            for sighting in track.settled:
+                landmark_id = self.landmarks.state(sighting).landmark_id
+                if landmark_id is not None:
+                    freed.add((landmark_id, sighting.stamp_ns))
+            reopened += track.settled
+            track.reopen(track.settled)
+            track.identity = identity
+        # sightings that lost their frame's landmark to one that is retracted now
+        for track in self._tracks.values() if freed else ():
+            displaced = [s for s in track.settled if self._is_displaced_from(s, track, freed)]
+            if displaced:
+                reopened += displaced
+                track.reopen(displaced)
+                self._claims.append(track)
+        return Decision.of([*given_up, *map(self._waiting, reopened)])
+
+    def associate(self, frame: Frame | None) -> Decision:  # noqa: ARG002
+        """Associate what waits in the tracks that this frame decides.
+
+        Where two tracks claim one landmark in one earlier frame, a sighting that is used already stays. Else that of
+        the track with the more probable row gets it.
+        """
+        associated: list[Assignment] = []
+        taken_ns: dict[int, set[int]] = {}
+        for track in self._claims:
+            if track.waiting and track.identity >= 0:
+                if track.identity not in taken_ns:
+                    taken_ns[track.identity] = self.landmarks.stamps_ns(track.identity)
+                associated += self._associate(track, taken_ns[track.identity])
+        return Decision.of(associated)
+
+    def rivals(self, frame: Frame, world_T_sonar: gtsam.Pose3) -> list[int]:  # noqa: ARG002
+        """Landmarks of the graph that the detections name."""
+        return [L(frame.ids[row]) for row in self._named(frame) if frame.ids[row] in self.landmarks]
+
+    def judge(self, seen: SeenFrame) -> Decision:
+        """Use what has an identity, inside the gate if its landmark is in the graph. The rest waits in its track."""
+        frame = seen.frame
+        named = self._named(frame)
+        known = [row for row in named if frame.ids[row] in self.landmarks]
+        judged = self._compared(seen, known) if known else []
+        judged += [self._begun(seen, row) for row in named if row not in known]
+        others = [row for row in range(len(frame)) if frame.refusals[row] is not None]
+        for row, sighting in zip(others, seen.sightings(others, seen.beam_points(others)), strict=True):
+            # repeated: a more probable row of the frame has the landmark
+            is_repeated = frame.refusals[row] is Outcome.REPEATED
+            judged.append(Assignment(sighting, Outcome.REPEATED if is_repeated else Outcome.WAITING))
+        track_of = dict(zip(frame.rows, frame.detections.track.tolist(), strict=True))
+        for each in judged:
+            track = self._tracks.get(track_of[each.sighting.row])
+            if track is None:  # of no track: final
+                continue
+            if each.outcome is Outcome.WAITING:
+                track.waiting.append(each.sighting)
+            else:
+                track.settled.append(each.sighting)
+        return Decision.of(judged)
+
+    def held(self) -> dict[int, float]:
+        """Keyframes of sightings that wait, of tracks that may still be of a landmark."""
+        return {
+            sighting.line.pose_key: (sighting.stamp_ns + self._longest_wait_ns) / NS_PER_S
+            for track in self._tracks.values()
+            if track.identity != NO_LANDMARK
+            for sighting in track.waiting
+        }
 
     def forget(self, now_ns: int, left: Set[int] = frozenset()) -> list[Assignment]:
-        """Forget sightings that have waited too long or leave the window, and tracks that are over."""
-        oldest_ns, given_up = now_ns - self._longest_wait_ns, []
+        """Give up sightings that have waited too long or leave the window, and drop tracks that are over."""
+        oldest_ns = now_ns - self._longest_wait_ns
+        given_up: list[Assignment] = []
         for track in self._tracks.values():
-            gone = {s for s in track.waiting if s.stamp_ns < oldest_ns or s.line.pose_key in left}
-            if gone:
+            old = {s for s in track.waiting if s.stamp_ns < oldest_ns or s.line.pose_key in left}
+            if old:
                 why = Outcome.NO_IDENTITY if track.identity == NO_LANDMARK else Outcome.FORGOTTEN
-                given_up += [Assignment(s, why) for s in track.waiting if s in gone and s.outcome is Outcome.WAITING]
-                track.waiting = [sighting for sighting in track.waiting if sighting not in gone]
+                # a retracted sighting stays one
+                given_up += [
+                    Assignment(s, why)
+                    for s in track.waiting
+                    if s in old and self.landmarks.state(s).outcome is Outcome.WAITING
+                ]
+                track.waiting = [sighting for sighting in track.waiting if sighting not in old]
             if left:
                 track.settled = [sighting for sighting in track.settled if sighting.line.pose_key not in left]
         self._tracks = {number: track for number, track in self._tracks.items() if track.newest_ns >= oldest_ns}
-        return given_up + ([] if self._nameless is None else self._nameless.forget(left))
+        return given_up
 
-    def smoothed(self) -> Solution:
-        """Solution of the whole graph."""
-        return Solution(*self._landmarks.smoother.solve_history(), self._landmarks.ids)
-
-    def rechosen(self) -> list[Assignment]:
-        """Nothing is chosen anew."""
-        return []
-
-    def _hear(self, frame: LandmarkDetections) -> Iterator[list[Assignment]]:
-        """Bring earlier sightings in line with what a frame's rows decide (`decide`), before its own are judged.
-
-        Where tracks come to claim one landmark in one earlier frame, that of the more probable row gets it, but what is
-        used already stays; where it is taken back, the one that it had displaced is used.
-        """
-        stamp_ns = int(frame.stamps_ns[0])
-        yield self.forget(stamp_ns)
-        decisions, decided = decide(frame, self._minimum_probability), []
-        for row in np.argsort(-frame.most_probable()[1], kind="stable").tolist():
-            track = self._tracks.setdefault(int(frame.track[row]), Track())
-            track.newest_ns = stamp_ns
+    def _decided(self, frame: Frame) -> list[tuple[Track, int]]:
+        """Tracks that rows of a frame decide, with the decisions, the most probable row first."""
+        decisions = decide(frame.detections, self._minimum_probability)
+        probability = frame.detections.most_probable()[1]
+        decided = []
+        for row in np.argsort(-probability, kind="stable").tolist():
+            track = self._tracks.setdefault(int(frame.detections.track[row]), Track())
+            track.newest_ns = frame.stamp_ns
             if decisions[row] != UNDECIDED:
                 decided.append((track, decisions[row]))
-        changed = [(track, new) for track, new in decided if new != track.identity]
-        leaving = [s for track, _ in changed for s in track.settled]
-        freed = {(s.landmark_id, s.stamp_ns) for s in leaving if s.landmark_id is not None}
-        back, displaced = [], []
-        for track, new in changed:
-            back += track.reopen(track.settled)
-            track.identity = new
-        for track in self._tracks.values() if freed else ():
-            may_return = [s for s in track.settled if s.outcome is Outcome.REPEATED]
-            if again := [s for s in may_return if (track.identity, s.stamp_ns) in freed]:
-                back += track.reopen(again)
-                displaced.append(track)
-        yield back
-        coming: list[Assignment] = []
-        taken: dict[int, set[int]] = {}
-        for track in [track for track, _ in decided] + displaced:
-            if track.waiting and track.identity >= 0:
-                stamps_ns = taken.setdefault(track.identity, self._landmarks.stamps_ns(track.identity))
-                coming += self._settle(track, stamps_ns)
-        yield coming
+        return decided
 
-    def _settle(self, track: Track, taken_ns: set[int]) -> list[Assignment]:
-        """Judge a track's waiting sightings; frames that show its landmark already are taken.
+    def _waiting(self, sighting: Sighting) -> Assignment:
+        """Let a sighting wait; one in the graph is retracted."""
+        is_in_graph = self.landmarks.state(sighting).landmark_id is not None
+        return Assignment(sighting, Outcome.TAKEN_BACK if is_in_graph else Outcome.WAITING)
 
-        They pass the gate one by one, as those that come at once, from keyframes as estimated now; all pass where the
-        landmark is not in the graph.
+    def _is_displaced_from(self, sighting: Sighting, track: Track, freed: set[tuple[int, int]]) -> bool:
+        """True when its frame showed the landmark of its track elsewhere, and no longer does."""
+        is_free = (track.identity, sighting.stamp_ns) in freed
+        return is_free and self.landmarks.state(sighting).outcome is Outcome.REPEATED
+
+    def _associate(self, track: Track, taken_ns: set[int]) -> list[Assignment]:
+        """Judge the waiting sightings of a track; frames that show its landmark already are taken.
+
+        They pass the gate one by one, from keyframes as estimated now. All pass where the landmark is not in the graph.
         """
-        smoother, key = self._landmarks.smoother, L(track.identity)
-        free = []
+        free: list[Sighting] = []
         for sighting in track.waiting:
             if sighting.stamp_ns not in taken_ns:
                 taken_ns.add(sighting.stamp_ns)
                 free.append(sighting)
-        inside = set(free)
-        if np.isfinite(self._gate) and free and smoother.estimates.exists(key):
-            joint = smoother.joint_covariance_of_any([key, *{sighting.line.pose_key for sighting in free}])
-            point = smoother.estimates.atPoint3(key)[None]
-            for sighting in free:
-                view = late_view(sighting, smoother.estimates, joint)
-                if view.compare([key], point, sighting.line.z[None], sighting.noise[None]).distance[0] > self._gate:
-                    inside.remove(sighting)
+        outcomes = dict.fromkeys(track.waiting, Outcome.REPEATED)
+        for sighting, is_inside in zip(free, self._pass_gate(free, L(track.identity)), strict=True):
+            is_retracted = self.landmarks.state(sighting).outcome is Outcome.TAKEN_BACK
+            used = Outcome.MOVED if is_retracted else Outcome.USED_LATER
+            outcomes[sighting] = used if is_inside else Outcome.GATED
+        track.settled += track.waiting
+        track.waiting = []
+        return [Assignment(sighting, outcome, track.identity) for sighting, outcome in outcomes.items()]
+
+    def _pass_gate(self, sightings: list[Sighting], key: int) -> list[bool]:
+        """Flags of earlier sightings that lie inside the gate of a landmark."""
+        values = self.smoother.estimates
+        if not sightings or math.isinf(self._gate) or not values.exists(key):
+            return [True] * len(sightings)
+        joint = self.smoother.joint_covariance_of_any([key, *{s.line.pose_key for s in sightings}])
+        point = values.atPoint3(key)[None]
+        flags = []
+        for sighting in sightings:
+            view = late_view(sighting, values, joint)
+            compared = view.compare([key], point, sighting.line.z[None], sighting.noise[None])
+            flags.append(bool(compared.distance[0] <= self._gate))
+        return flags
+
+    def _named(self, frame: Frame) -> list[int]:
+        """Detections whose identity is accepted."""
+        return [row for row, why in enumerate(frame.refusals) if why is None]
+
+    def _compared(self, seen: SeenFrame, rows: list[int]) -> list[Assignment]:
+        """Use detections of landmarks of the graph that lie inside the gate."""
+        frame = seen.frame
+        keys = [L(frame.ids[row]) for row in rows]
+        landmarks = np.array([self.smoother.estimates.atPoint3(key) for key in keys])  # (m, 3)
+        compared = seen.view.compare(keys, landmarks, frame.z[rows], frame.noise[rows])
+        # a sighting of a track may change its landmark, so that its noise must not depend on one
+        is_tracked = frame.detections.track[rows] != NO_TRACK
+        points = np.where(is_tracked[:, None], seen.beam_points(rows), landmarks)
         judged = []
-        for sighting in track.waiting:
-            used = Outcome.MOVED if sighting.outcome is Outcome.TAKEN_BACK else Outcome.USED_LATER
-            refused = Outcome.GATED if sighting in set(free) else Outcome.REPEATED
-            judged.append(Assignment(sighting, used if sighting in inside else refused, track.identity))
-        track.settled, track.waiting = track.settled + track.waiting, []
+        for k, sighting in enumerate(seen.sightings(rows, points)):
+            is_inside = bool(compared.distance[k] <= self._gate)
+            judged.append(
+                Assignment(
+                    sighting,
+                    Outcome.USED if is_inside else Outcome.GATED,
+                    frame.ids[rows[k]],
+                    compared.innovation[k],
+                    compared.S[k],
+                    gain=float(compared.gain[k]) if is_inside else 0.0,
+                )
+            )
         return judged
 
-    def _judge(self, frame: SeenFrame, rows: list[int]) -> list[Assignment]:
-        """Use what has an identity, inside the gate if its landmark is in the graph; the rest waits in its track."""
-        values, make = self._landmarks.smoother.estimates, self._landmarks.factors
-        ids, refusals, is_tracked = frame.ids, frame.refusals, frame.detections.track != NO_TRACK
-        named = [row for row in rows if refusals[row] is None]
-        known = [row for row in named if ids[row] in self._landmarks]
-        keys = [L(ids[row]) for row in known]
-        view, judged = frame.predict(keys), []
-        if known:
-            points = np.array([values.atPoint3(key) for key in keys])
-            found = view.compare(keys, points, frame.z[known], frame.noise[known])
-            at = np.where(is_tracked[known, None], np.nan, points)
-            for k, sighting in enumerate(frame.sightings(view, known, at)):
-                is_inside = bool(found.distance[k] <= self._gate)
-                outcome, gain = (Outcome.USED, float(found.gain[k])) if is_inside else (Outcome.GATED, 0.0)
-                judged.append(Assignment(sighting, outcome, ids[known[k]], found.innovation[k], found.S[k], gain))
-        for row in named:
-            if row not in known:  # a landmark begins on the known floor where it can stand on it, else on the beam
-                floor = frame.floor_under(view, row)
-                elevation = make.elevation_on(floor, view.world_T_sonar, frame.z[row])
-                start = beam_point(view.world_T_sonar, frame.z[row], elevation)
-                (sighting,) = frame.sightings(view, [row], None if is_tracked[row] else start[None])
-                sighting.floor, sighting.elevation_rad = floor, 0.0 if is_tracked[row] else elevation
-                judged.append(Assignment(sighting, Outcome.NEW, ids[row], start=start))
-        kept = [row for row in rows if refusals[row] is not None]
-        for row, sighting in zip(kept, frame.sightings(view, kept), strict=True):
-            is_taken = refusals[row] is Outcome.REPEATED  # a more probable row of the frame has the landmark
-            judged.append(Assignment(sighting, Outcome.REPEATED if is_taken else Outcome.WAITING))
-        return judged
+    def _begun(self, seen: SeenFrame, row: int) -> Assignment:
+        """Begin a landmark, on the known floor where it can stand on it, else on the centre beam."""
+        frame = seen.frame
+        z = frame.z[row]
+        elevation_rad = seen.factors.elevation_on(seen.floor_under(row), seen.view.world_T_sonar, z)
+        start = locate(seen.view.world_T_sonar, z[0], z[1], elevation_rad)
+        # as in `_compared`: of a track, the sighting must not depend on where this landmark begins
+        if frame.detections.track[row] == NO_TRACK:
+            (sighting,) = seen.sightings([row], start[None], elevation_rad)
+        else:
+            (sighting,) = seen.sightings([row], seen.beam_points([row]))
+        return Assignment(sighting, Outcome.NEW, frame.ids[row], start=start)
+
+
+def decide(frame: LandmarkDetections, least_probability: float) -> list[int]:
+    """Decision of each row: a landmark's identity, `NO_LANDMARK` or `UNDECIDED`."""
+    ids, probability = frame.most_probable()
+    none = 1.0 - frame.id_probability.sum(axis=1)  # the posterior of no known landmark
+    decisions = np.where(none >= least_probability, NO_LANDMARK, UNDECIDED)
+    is_named = (probability >= least_probability) & (ids >= 0)
+    return np.where(is_named, ids, decisions).tolist()
+
+
+def second_rows_of_tracks(frame: LandmarkDetections, identities: Mapping[int, int]) -> list[Outcome | None]:
+    """Refusals of the rows of a frame that show an object a second time; None: the row stays.
+
+    A track is one object in one place, so each frame keeps one row of it: the row with the highest posterior for the
+    landmark that the track counts as, by ``identities``; else the highest posterior for any landmark; of equals the
+    first.
+    """
+    tracks = frame.track.tolist()
+    best: dict[int, tuple[float, float, int]] = {}
+    for row, track in enumerate(tracks):
+        if track == NO_TRACK:
+            continue
+        is_landmark = frame.candidate_ids[row] >= 0
+        ids = frame.candidate_ids[row, is_landmark]
+        posterior = frame.id_probability[row, is_landmark]
+        of_identity = float(posterior[ids == identities.get(track, UNDECIDED)].sum())
+        score = (of_identity, float(posterior.max(initial=0.0)), -row)
+        best[track] = max(best.get(track, score), score)
+    return [
+        None if track == NO_TRACK or -best[track][2] == row else Outcome.TRACK_REPEATED
+        for row, track in enumerate(tracks)
+    ]

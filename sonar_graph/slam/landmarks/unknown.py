@@ -1,8 +1,8 @@
 """Unknown landmarks: detections without identities, paired by geometry (docs/theory/unknown_landmarks.md).
 
-They are paired with the landmarks of the graph, named ones too, by joint compatibility. What is left waits, tied to its
-keyframe, and is paired with what waits of earlier frames. Once enough sightings of one candidate place it well enough,
-they become factors, each on its own keyframe, and the candidate a landmark.
+They are paired with the landmarks of the graph, named ones too, by joint compatibility. An unpaired sighting waits,
+tied to its keyframe, and is paired with sightings of later frames: together they are a candidate. Once the sightings of
+a candidate place it well enough, they become factors, each on its own keyframe, and the candidate a landmark.
 
 Two landmarks a, b of the graph are one, and are merged, when
 
@@ -12,12 +12,12 @@ Two landmarks a, b of the graph are one, and are merged, when
 * the density of the horizontal difference ``N(d_xy; 0, S_xy)``, 1/m², exceeds that of neighbours which are not in the
   map. Where S is wide it does not.
 
-Sigma is the noise of one sighting: of two landmarks in one place each gets the sightings on its side, so that they stay
-apart by about that, and P does not know it.
+Sigma is the noise of one sighting. Of two landmarks in one place each gets the sightings on its side, so that they stay
+apart by about sigma, which P does not contain.
 """
 
 import math
-from collections.abc import Iterator, Set
+from collections.abc import Set
 from itertools import combinations
 from typing import Annotated, Literal, NamedTuple
 
@@ -30,13 +30,25 @@ from pydantic import Field
 from sonar_graph.calibration import Section
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats, LandmarkDetections
-from sonar_graph.models import gate_threshold, wrap_angle
+from sonar_graph.models import gate_threshold, locate_jacobians, range_azimuth_jacobians, wrap_angle
 from sonar_graph.slam.keyframes import Keyframes
-from sonar_graph.slam.landmarks.joint_compatibility import UNPAIRED, Innovations, believed, log_density, pair_jointly
-from sonar_graph.slam.landmarks.landmark_graph import Assignment, LandmarkGraph
-from sonar_graph.slam.landmarks.sighting import SeenFrame, Sighting, place, source
-from sonar_graph.slam.prediction import PredictedView
-from sonar_graph.slam.smoother import JointCovariance
+from sonar_graph.slam.landmarks.joint_compatibility import (
+    UNPAIRED,
+    Innovations,
+    drop_unlikely,
+    log_density,
+    pair_jointly,
+)
+from sonar_graph.slam.landmarks.landmark_graph import (
+    UNCHANGED,
+    Assignment,
+    Decision,
+    IdentityPolicy,
+    LandmarkGraph,
+)
+from sonar_graph.slam.landmarks.sighting import Frame, SeenFrame, Sighting, SightingFactors
+from sonar_graph.slam.prediction import PredictedView, Source
+from sonar_graph.slam.smoother import JointCovariance, Known
 from sonar_graph.states import FIRST_ANONYMOUS_ID, Outcome
 from sonar_graph.tagged_sections import tagged
 
@@ -58,7 +70,7 @@ class IgnoredUnknown(Section):
 class AssociatedUnknown(Section):
     """Pair detections that name no landmark with landmarks by geometry.
 
-    Begins landmarks with identities from 3000000000 on; docs/theory/unknown_landmarks.md says on what conditions.
+    Begins landmarks with identities from 3000000000 on, under the conditions of docs/theory/unknown_landmarks.md.
 
     Examples
     --------
@@ -92,40 +104,6 @@ def unnamed(frame: LandmarkDetections) -> NDArray[np.bool_]:
     return np.asarray((frame.candidate_ids < 0).all(axis=1))
 
 
-def nearest_duplicates(
-    landmarks: LandmarkGraph, values: gtsam.Values, covariance: JointCovariance, params: AssociatedUnknown
-) -> tuple[int, int] | None:
-    """Nearest two landmarks that are one, or None: that which stays and that which becomes part of it.
-
-    A named landmark stays, of two anonymous ones the one with the lower identity. The covariance is of all of them.
-    """
-    named = [i for i in landmarks.ids if i < FIRST_ANONYMOUS_ID]
-    nameless = landmarks.ids[len(named) :]
-    pairs = [(a, b) for b in nameless for a in named] + list(combinations(nameless, 2))
-    if not pairs:
-        return None
-    points = {i: values.atPoint3(L(i)) for i in landmarks.ids}
-    rows = {i: covariance.rows[L(i)] + np.arange(3) for i in points}
-    a, b = (np.array([rows[pair[side]] for pair in pairs]) for side in (0, 1))
-    P, d = covariance.matrix, np.array([points[i] - points[j] for i, j in pairs])
-    signed = ((1, a, a), (1, b, b), (-1, a, b), (-1, b, a))
-    S = np.asarray(sum(sign * P[i[:, :, None], j[:, None, :]] for sign, i, j in signed))
-    noise = {}
-    for i in points:  # of a sighting, across or along its beam, whichever is larger, m²
-        sighting = landmarks.any_sighting(i)
-        noise[i] = float(max(sighting.noise[0, 0], sighting.line.z[0] ** 2 * sighting.noise[1, 1]))
-    S = S + np.array([max(noise[i], noise[j]) for i, j in pairs])[:, None, None] * np.eye(3)
-    distance = np.einsum("ki,ki->k", d, np.linalg.solve(S, d[..., None])[..., 0])
-    for k in np.argsort(distance).tolist():
-        stays, goes = pairs[k]
-        is_near = distance[k] <= gate_threshold(params.gate_probability, 3)
-        of_both = landmarks.stamps_ns(stays) & landmarks.stamps_ns(goes)
-        is_dense = is_near and log_density(d[k][:2], S[k][:2, :2]) > params.log_rival
-        if is_dense and not of_both and not landmarks.is_rooted(goes):
-            return stays, goes
-    return None
-
-
 Candidate = list[Sighting]
 """Sightings that may be of one landmark, in the order of time."""
 
@@ -133,22 +111,25 @@ Candidate = list[Sighting]
 class PairedDetection(NamedTuple):
     """Landmark or candidate that a detection was paired with, or neither."""
 
-    landmark_id: int | None
-    candidate: Candidate | None
+    landmark_id: int | None = None
+    candidate: Candidate | None = None
     innovation: Floats | None = None
     """Innovation against the landmark, shape (2,)."""
     S: Floats | None = None
     """Its covariance, shape (2, 2)."""
 
 
-class NamelessLandmarks:
+class NamelessLandmarks(IdentityPolicy):
     """Pairs detections without identities, and begins and merges landmarks."""
 
     def __init__(self, landmarks: LandmarkGraph, keyframes: Keyframes, params: AssociatedUnknown) -> None:
-        self._landmarks, self._keyframes, self._params = landmarks, keyframes, params
-        self._smoother, self._factors = landmarks.smoother, landmarks.factors
-        self._longest_wait_s = max(min(params.longest_wait_s, self._smoother.params.lag_s - ROUNDING_S), 0.0)
+        super().__init__(landmarks)
+        self._keyframes = keyframes
+        self._params = params
+        self._longest_wait_s = max(min(params.longest_wait_s, self.smoother.params.lag_s - ROUNDING_S), 0.0)
         self._candidates: list[Candidate] = []
+        self._grown: list[Candidate] = []
+        """Candidates of which the last frame has a sighting."""
         self._next_id = FIRST_ANONYMOUS_ID
 
     def refuse_taken_ids(self, frame: LandmarkDetections) -> None:
@@ -161,67 +142,84 @@ class NamelessLandmarks:
                 ' below that, or give it identity.unknown.policy = "ignore"'
             )
 
-    def assign(self, frame: SeenFrame, rows: list[int], taken: set[int]) -> Iterator[list[Assignment]]:
-        """Merge two landmarks that are one; pair the rows that name none; begin landmarks of what has waited.
+    def retract(self, frame: Frame | None) -> Decision:  # noqa: ARG002
+        """Give up sightings that have waited too long."""
+        return Decision.of(self.forget())
 
-        ``taken``: landmarks that are named in this frame.
-        """
-        yield self.forget()
-        if len(self._landmarks.ids) > 1 and self._landmarks.ids[-1] >= FIRST_ANONYMOUS_ID:
-            joint = self._smoother.joint_covariance([self._keyframes.newest_key, *self._keys()])
-            if found := nearest_duplicates(self._landmarks, self._smoother.estimates, joint, self._params):
-                stays, goes = found
-                yield [Assignment(s, Outcome.MOVED, stays) for s in self._landmarks.sightings(goes)]
-        if not rows:
-            return
-        view = frame.predict(self._keys())
-        paired = self.pair(view, frame.z[rows], frame.noise[rows], taken)
-        assigned, grown = [], []
-        for sighting, (i, candidate, e, S) in zip(frame.sightings(view, rows), paired, strict=True):
-            if i is not None and S is not None:
-                gain = float((np.diag(S) / np.diag(sighting.noise)).max()) - 1.0
-                assigned.append(Assignment(sighting, Outcome.USED, i, e, S, gain))
+    def associate(self, frame: Frame | None) -> Decision:  # noqa: ARG002
+        """Merge the nearest two landmarks that are one."""
+        ids = self.landmarks.ids
+        if len(ids) < 2 or ids[-1] < FIRST_ANONYMOUS_ID:
+            return UNCHANGED
+        joint = self.smoother.joint_covariance([self._keyframes.newest_key, *self._keys()])
+        duplicates = nearest_duplicates(self.landmarks, self.smoother.estimates, joint, self._params)
+        if duplicates is None:
+            return UNCHANGED
+        stays, goes = duplicates
+        return Decision.of(Assignment(s, Outcome.MOVED, stays) for s in self.landmarks.sightings(goes))
+
+    def rivals(self, frame: Frame, world_T_sonar: gtsam.Pose3) -> list[int]:  # noqa: ARG002
+        """All landmarks, and the keyframes of all candidates."""
+        return self._keys()
+
+    def judge(self, seen: SeenFrame) -> Decision:
+        """Use paired detections; let the others wait, each with its candidate."""
+        self._grown = []
+        rows = list(range(len(seen.frame)))
+        paired = self.pair(seen.view, seen.frame.z, seen.frame.noise, seen.taken)
+        judged = []
+        for sighting, pair in zip(seen.sightings(rows, seen.beam_points(rows)), paired, strict=True):
+            if pair.landmark_id is not None and pair.S is not None:
+                gain = float((np.diag(pair.S) / np.diag(sighting.noise)).max()) - 1.0  # S = S_0 + R
+                judged.append(Assignment(sighting, Outcome.USED, pair.landmark_id, pair.innovation, pair.S, gain))
                 continue
-            if candidate is None:
+            candidate = pair.candidate
+            if candidate is None:  # neither near a landmark nor near what waits
                 candidate = []
                 self._candidates.append(candidate)
             candidate.append(sighting)
-            grown.append(candidate)
-            assigned.append(Assignment(sighting, Outcome.WAITING))
-        yield assigned
-        for candidate in grown:
+            self._grown.append(candidate)
+            judged.append(Assignment(sighting, Outcome.WAITING))
+        return Decision.of(judged)
+
+    def reconsider(self) -> Decision:
+        """Begin a landmark of the next candidate that is placed well enough."""
+        while self._grown:
+            candidate = self._grown.pop(0)
             if self.is_placed(candidate):
                 self._candidates.remove(candidate)
-                begins, self._next_id = self._next_id, self._next_id + 1
+                landmark_id = self._next_id
+                self._next_id += 1
                 *earlier, newest = candidate
-                yield [
-                    *(Assignment(sighting, Outcome.PLACED_LATER, begins) for sighting in earlier),
-                    Assignment(newest, Outcome.NEW, begins),
-                ]
+                later = [Assignment(sighting, Outcome.PLACED_LATER, landmark_id) for sighting in earlier]
+                return Decision.of([*later, Assignment(newest, Outcome.NEW, landmark_id)])
+        return UNCHANGED
 
     def is_placed(self, candidate: Candidate) -> bool:
         """True when a candidate has enough sightings, which place it well enough."""
         if len(candidate) < self._params.sightings:
             return False
-        _, cov = place(candidate, self._smoother.estimates, self._factors)
-        return bool(np.linalg.eigvalsh(cov)[-1] <= (LARGEST_SIGMA_SHARE * candidate[-1].line.z[0]) ** 2)
+        _, P = place(candidate, self.smoother.estimates, self.landmarks.factors)
+        return bool(np.linalg.eigvalsh(P)[-1] <= (LARGEST_SIGMA_SHARE * candidate[-1].line.z[0]) ** 2)
 
-    def forget(self, left: Set[int] = frozenset()) -> list[Assignment]:
-        """Forget sightings on keyframes that are too old, or leave a bounded window."""
+    def forget(self, now_ns: int = 0, left: Set[int] = frozenset()) -> list[Assignment]:  # noqa: ARG002
+        """Give up sightings on keyframes that are too old, or leave a bounded window."""
         oldest = self._keyframes.oldest_key(self._longest_wait_s)
-        waiting = [sighting for candidate in self._candidates for sighting in candidate]
-        gone = {s for s in waiting if s.line.pose_key < oldest or s.line.pose_key in left}
-        if gone:
-            kept = [[sighting for sighting in candidate if sighting not in gone] for candidate in self._candidates]
-            self._candidates = [candidate for candidate in kept if candidate]
-        return [Assignment(sighting, Outcome.FORGOTTEN) for sighting in waiting if sighting in gone]
+        given_up = []
+        for candidate in self._candidates:
+            old = [s for s in candidate if s.line.pose_key < oldest or s.line.pose_key in left]
+            given_up += [Assignment(sighting, Outcome.FORGOTTEN) for sighting in old]
+            for sighting in old:
+                candidate.remove(sighting)
+        self._candidates = [candidate for candidate in self._candidates if candidate]
+        return given_up
 
     def _keys(self) -> list[int]:
-        """Keys whose joint covariance pairing needs: all landmarks, and keyframes that saw candidates."""
+        """Keys whose joint covariance pairing needs: all landmarks, and keyframes of candidates."""
         seen_from = {candidate[-1].line.pose_key for candidate in self._candidates}
-        return [*(L(i) for i in self._landmarks.ids), *sorted(seen_from)]
+        return [*map(L, self.landmarks.ids), *sorted(seen_from)]
 
-    def pair(self, view: PredictedView, z: Floats, noise: Floats, taken: set[int]) -> list[PairedDetection]:
+    def pair(self, view: PredictedView, z: Floats, noise: Floats, taken: Set[int]) -> list[PairedDetection]:
         """Pair each detection of a frame with a landmark, or else with a candidate.
 
         Parameters
@@ -231,42 +229,121 @@ class NamelessLandmarks:
         taken
             Landmarks that are named in this frame.
         """
-        values = self._smoother.estimates
-        ids = [i for i in self._landmarks.ids if i not in taken]
+        values = self.smoother.estimates
+        ids = [i for i in self.landmarks.ids if i not in taken]
         keys = [L(i) for i in ids]
         points = np.array([values.atPoint3(key) for key in keys])
-        sources = [source(candidate[-1], values, self._factors) for candidate in self._candidates]
+        sources = [source(candidate[-1], values, self.landmarks.factors) for candidate in self._candidates]
+        paired = [PairedDetection()] * len(z)
         if not keys and not sources:
-            return [PairedDetection(None, None)] * len(z)
-        expected, cov = view.expect_jointly(keys, points, sources)
-        of_landmarks = _choose(z, noise, expected[: len(ids)], cov[: 2 * len(ids), : 2 * len(ids)], self._params)
-        left = [i for i, (landmark, *_) in enumerate(of_landmarks) if landmark == UNPAIRED]
-        of_candidates = _choose(
-            z[left], noise[left], expected[len(ids) :], cov[2 * len(ids) :, 2 * len(ids) :], self._params
-        )
-        paired = [
-            PairedDetection(ids[j], None, e, S) if j != UNPAIRED else PairedDetection(None, None)
-            for j, e, S in of_landmarks
-        ]
-        for i, (j, *_) in zip(left, of_candidates, strict=True):
-            paired[i] = PairedDetection(None, self._candidates[j] if j != UNPAIRED else None)
+            return paired
+        expected, P = view.expect_jointly(keys, points, sources)
+        n = len(ids)
+        # landmarks first; a candidate takes only what no landmark explains
+        innovations = _innovations(z, noise, expected[:n], P[: 2 * n, : 2 * n])
+        of_landmarks = self._choose(innovations, z)
+        for i, j in of_landmarks.items():
+            S = innovations.expected_cov[2 * j : 2 * j + 2, 2 * j : 2 * j + 2] + noise[i]
+            paired[i] = PairedDetection(ids[j], None, innovations.innovation[i, j], S)
+        left = [i for i in range(len(z)) if i not in of_landmarks]
+        innovations = _innovations(z[left], noise[left], expected[n:], P[2 * n :, 2 * n :])
+        for i, j in self._choose(innovations, z[left]).items():
+            paired[left[i]] = PairedDetection(None, self._candidates[j])
         return paired
 
+    def _choose(self, innovations: Innovations, z: Floats) -> dict[int, int]:
+        """Index of what each detection is paired with, for those that are paired."""
+        if innovations.innovation.size == 0:
+            return {}
+        compatible = pair_jointly(innovations, self._params.gate_probability)
+        # a density per area is r times that per range and azimuth
+        likely = drop_unlikely(innovations, compatible, self._params.log_rival + np.log(z[:, 0]))
+        return {i: j for i, j in enumerate(likely.landmarks) if j != UNPAIRED}
 
-def _choose(
-    z: Floats, noise: Floats, expected: Floats, cov: Floats, policy: AssociatedUnknown
-) -> list[tuple[int, Floats | None, Floats | None]]:
-    """For each detection the index of what it is paired with, the innovation and its covariance."""
-    if not len(z) or not len(expected):
-        return [(UNPAIRED, None, None)] * len(z)
+
+def _innovations(z: Floats, noise: Floats, expected: Floats, expected_cov: Floats) -> Innovations:
+    """Innovations of m detections against n expectations, shapes (m, 2) and (n, 2)."""
     e = z[:, None] - expected[None]
-    for i, j in np.ndindex(e.shape[:2]):
-        e[i, j, 1] = wrap_angle(e[i, j, 1])
-    innovations = Innovations(e, cov, noise)
-    pairing = believed(
-        innovations, pair_jointly(innovations, policy.gate_probability), policy.log_rival + np.log(z[:, 0])
-    )
-    return [
-        (j, e[i, j], cov[2 * j : 2 * j + 2, 2 * j : 2 * j + 2] + noise[i]) if j != UNPAIRED else (UNPAIRED, None, None)
-        for i, j in enumerate(pairing.landmarks)
-    ]
+    e[..., 1] = wrap_angle(e[..., 1])
+    return Innovations(e, expected_cov, noise)
+
+
+def nearest_duplicates(
+    landmarks: LandmarkGraph, values: Known, covariance: JointCovariance, params: AssociatedUnknown
+) -> tuple[int, int] | None:
+    """Nearest two landmarks that are one, or None: that which stays and that which becomes part of it.
+
+    A named landmark stays, of two anonymous ones the one with the lower identity. The covariance is of all of them.
+    """
+    named = [i for i in landmarks.ids if i < FIRST_ANONYMOUS_ID]
+    nameless = landmarks.ids[len(named) :]
+    pairs = [(a, b) for b in nameless for a in named] + list(combinations(nameless, 2))
+    if not pairs:
+        return None
+    points = {i: values.atPoint3(L(i)) for i in landmarks.ids}
+    noise = {i: _noise_m2(landmarks.any_sighting(i)) for i in landmarks.ids}
+    d = np.array([points[a] - points[b] for a, b in pairs])  # (k, 3)
+    sigma2 = np.array([max(noise[a], noise[b]) for a, b in pairs])
+    of_a = np.array([covariance.rows[L(a)] for a, _ in pairs])[:, None] + np.arange(3)  # (k, 3)
+    of_b = np.array([covariance.rows[L(b)] for _, b in pairs])[:, None] + np.arange(3)
+
+    def P(i: NDArray[np.int64], j: NDArray[np.int64]) -> Floats:
+        return np.asarray(covariance.matrix[i[:, :, None], j[:, None, :]])  # (k, 3, 3)
+
+    S = P(of_a, of_a) + P(of_b, of_b) - P(of_a, of_b) - P(of_b, of_a) + sigma2[:, None, None] * np.eye(3)
+    distance = np.einsum("ki,ki->k", d, np.linalg.solve(S, d[..., None])[..., 0])
+    for k in np.argsort(distance).tolist():
+        stays, goes = pairs[k]
+        if distance[k] > gate_threshold(params.gate_probability, 3):
+            return None
+        is_dense = log_density(d[k, :2], S[k, :2, :2]) > params.log_rival
+        in_one_frame = landmarks.stamps_ns(stays) & landmarks.stamps_ns(goes)
+        if is_dense and not in_one_frame and not landmarks.is_rooted(goes):
+            return stays, goes
+    return None
+
+
+def _noise_m2(sighting: Sighting) -> float:
+    """Variance of a sighting across or along its beam, whichever is larger, m²."""
+    return float(max(sighting.noise[0, 0], sighting.line.z[0] ** 2 * sighting.noise[1, 1]))
+
+
+def source(sighting: Sighting, values: Known, factors: SightingFactors) -> Source:
+    """The point as located by one sighting.
+
+    With ``p = g(X, range, azimuth, elevation)``: ``cov = g_z diag(R, sigma_e²) g_z'``, sigma_e that of an elevation
+    anywhere in the aperture. On a floor, ``p_z ~ N(floor z, sigma²)`` narrows it.
+    """
+    line = sighting.line
+    X = values.atPose3(line.pose_key)
+    elevation = factors.elevation_on(sighting.floor, X.compose(line.body_T_sonar), line.z)
+    point, by_pose, by_polar = locate_jacobians(X, line.body_T_sonar, float(line.z[0]), float(line.z[1]), elevation)
+    polar_cov = np.zeros((3, 3))
+    polar_cov[:2, :2] = sighting.noise
+    polar_cov[2, 2] = factors.elevation_sigma_rad**2
+    cov = by_polar @ polar_cov @ by_polar.T
+    if sighting.floor is not None:
+        # condition on p_z, a measurement of the third component
+        cov = cov - np.outer(cov[:, 2], cov[2]) / (cov[2, 2] + sighting.floor.sigma_m**2)
+    return Source(line.pose_key, point, by_pose, cov)
+
+
+def place(sightings: list[Sighting], values: Known, factors: SightingFactors) -> tuple[Floats, Floats]:
+    """Point of several sightings, shape (3,), m, and its covariance, shape (3, 3), m².
+
+    The first sighting, corrected by the others one after the other::
+
+        K = P H' (H P H' + R)^-1,    p <- p + K (z - h(p)),    P <- (I - K H) P
+    """
+    first = source(sightings[0], values, factors)
+    point = first.point
+    P = first.cov
+    for sighting in sightings[1:]:
+        line = sighting.line
+        predicted, _, H = range_azimuth_jacobians(values.atPose3(line.pose_key), line.body_T_sonar, point)
+        K = np.linalg.solve(H @ P @ H.T + sighting.noise, H @ P).T  # (3, 2)
+        innovation = line.z - predicted
+        innovation[1] = wrap_angle(innovation[1])
+        point = point + K @ innovation
+        P = P - K @ H @ P
+    return point, P

@@ -22,7 +22,7 @@ import numpy as np
 
 from sonar_graph.measurements import Floats
 from sonar_graph.models import project, wrap_angle
-from sonar_graph.slam.smoother.variables import is_pose, picked, tangent_size
+from sonar_graph.slam.smoother.variables import Known, is_pose, picked, tangent_size
 
 MAX_STEPS = 50
 """Steps that a descent may try, whether or not they lower the error: each costs a factorisation of the graph."""
@@ -229,24 +229,24 @@ class Sightline:
     z: Floats
     """Range (m) and azimuth (rad), shape (2,)."""
 
-    def point(self, values: gtsam.Values) -> Floats:
+    def point(self, values: Known) -> Floats:
         """Point of the world where the landmark was measured, at elevation 0, shape (3,), m."""
         on_beam = self.z[0] * np.array([np.cos(self.z[1]), np.sin(self.z[1]), 0.0])
         return self._world_T_sonar(values).transformFrom(on_beam)
 
-    def is_behind(self, values: gtsam.Values, landmark: Floats) -> bool:
+    def is_behind(self, values: Known, landmark: Floats) -> bool:
         """True when a point of the world is a right angle or more off the measured azimuth."""
         x, y, _ = self._world_T_sonar(values).transformTo(landmark)
         return bool(x * np.cos(self.z[1]) + y * np.sin(self.z[1]) <= 0)
 
-    def miss_m(self, values: gtsam.Values, landmark: Floats) -> float:
+    def miss_m(self, values: Known, landmark: Floats) -> float:
         """Distance by which range and azimuth miss a point of the world."""
         x, y, z = self._world_T_sonar(values).transformTo(landmark)
         expected, _ = project(np.array([x, y, z]))
         turn_rad = wrap_angle(expected[1] - self.z[1])
         return math.hypot(expected[0] - self.z[0], self.z[0] * turn_rad)
 
-    def _world_T_sonar(self, values: gtsam.Values) -> gtsam.Pose3:
+    def _world_T_sonar(self, values: Known) -> gtsam.Pose3:
         return values.atPose3(self.pose_key).compose(self.body_T_sonar)
 
 
