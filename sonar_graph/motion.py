@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import gtsam
+import numpy as np
 
 from sonar_graph.calibration import Calibration, require_calibration
 from sonar_graph.errors import CalibrationError
@@ -74,6 +75,18 @@ class PreintegratedMotion:
         return self.i_T_j.compose(gtsam.Pose3.Expmap(self.D_bias @ (bias - self.bias)))
 
 
+EARTH_RATE_RAD_S = 7.292115e-5
+"""WGS 84."""
+
+
+def earth_rate_in_world(calibration: Calibration) -> Floats | None:
+    """Earth's angular rate in a world with x east, y north, z up, shape (3,), rad/s; None without a latitude."""
+    latitude = calibration.earth_rate_latitude_rad
+    if latitude is None:
+        return None
+    return EARTH_RATE_RAD_S * np.array([0.0, np.cos(latitude), np.sin(latitude)])
+
+
 def require_source(odometry: object, calibration: Calibration, call: str) -> None:
     """Refuse what is no calibration, no source of motion (TypeError), or made with another (CalibrationError)."""
     require_calibration(calibration, call)
@@ -121,7 +134,7 @@ class MotionSource(Protocol):
     Examples
     --------
     >>> from sonar_graph import Calibration, Odometry
-    >>> from sonar_graph.navigation import MotionSource
+    >>> from sonar_graph.motion import MotionSource
     >>> source: MotionSource = Odometry(Calibration())
     """
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import AlignmentError
 from sonar_graph.measurements import Dvl, Floats, Imu
-from sonar_graph.navigation.alignment.gravity import earth_rate_in_world
+from sonar_graph.motion import earth_rate_in_world
 from sonar_graph.numerics import chi_square_exceeded
 
 LEAST_COSINE = 1e-3
@@ -35,7 +35,7 @@ class InitialTilt:
     Examples
     --------
     >>> import numpy as np
-    >>> from sonar_graph.navigation import align_at_rest
+    >>> from sonar_graph.navigation.alignment import align_at_rest
     >>> from sonar_graph.testing import still_world
     >>> world = still_world()
     >>> tilt = align_at_rest(world.imu, world.calibration)
@@ -130,7 +130,7 @@ def align_at_rest(imu: Imu, calibration: Calibration, dvl: Dvl | None = None) ->
     >>> import numpy as np
     >>> from sonar_graph.calibration import Calibration
     >>> from sonar_graph.measurements import Imu
-    >>> from sonar_graph.navigation import align_at_rest
+    >>> from sonar_graph.navigation.alignment import align_at_rest
     >>> force = np.tile([0.0, 9.80665 * np.sin(0.1), 9.80665 * np.cos(0.1)], (500, 1))
     >>> tilt = align_at_rest(Imu(np.arange(500) * 10_000_000, np.zeros((500, 3)), force), Calibration())
     >>> round(tilt.roll_rad, 6)

@@ -28,9 +28,8 @@ from numpy.typing import NDArray
 
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.navigation.dvl_screening.partial_beams import Rows
+from sonar_graph.navigation.preintegration import covariance, row_of, rows_until
 from sonar_graph.navigation.samples import LATEST_NS, PARTIAL_M2_S2
-from sonar_graph.navigation.steps import covariance, rows_until
-from sonar_graph.navigation.steps import row as row_of
 from sonar_graph.numerics import O3, ZERO, Mat3, Vec3, compiled, inlined
 from sonar_graph.sequence import PAUSE_NS
 from sonar_graph.states import Refusal, RefusedRow
