@@ -98,6 +98,7 @@ class Odometry:
         self._hold_past = calibration.odometry_interpolation == "hold-past"
         self._turns = UNTURNED if self._hold_past else turns_of(calibration.imu)
         self._sensors = Sensors.of(calibration)
+        self._dvl_p_imu = (self._sensors.body_p_imu - self._sensors.body_p_dvl).tolist()
         self._earth = earth_rate_in_world(calibration)
         self._kept: Kept | None = None
 
@@ -222,19 +223,27 @@ class Odometry:
 
     def velocity_at_imu(self, epoch_ns: int) -> tuple[Floats, float]:
         """Velocity of the IMU's point at an epoch, body axes, shape (3,), m/s, and the variance of one component."""
-        rows = self.rows()
-        k = int(rows.dvl_ns.searchsorted(epoch_ns))
-        if k == len(rows.dvl_ns) or rows.dvl_ns[k] != epoch_ns:
-            raise no_doppler_stamp("epoch_ns", epoch_ns, rows.dvl_ns)
-        i = int(rows.imu_ns.searchsorted(epoch_ns))
-        w = rows.rate[min(i, len(rows.rate) - 1)]
-        if 0 < i < len(rows.rate) and not self._hold_past:
-            share = float((epoch_ns - rows.imu_ns[i - 1]) / (rows.imu_ns[i] - rows.imu_ns[i - 1]))
-            w = rows.rate[i - 1] + share * (w - rows.rate[i - 1])
-        x, y, z = w.tolist()
-        a, b, c = (self._sensors.body_p_imu - self._sensors.body_p_dvl).tolist()
+        velocity, cov, _ = self._dvl.values
+        dvl_ns = self._dvl.stamps_ns
+        k = int(dvl_ns.searchsorted(epoch_ns))
+        if k == len(dvl_ns) or dvl_ns[k] != epoch_ns:
+            raise no_doppler_stamp("epoch_ns", epoch_ns, dvl_ns)
+        x, y, z = self._rate_at(epoch_ns)
+        a, b, c = self._dvl_p_imu
         swing = y * c - z * b, z * a - x * c, x * b - y * a  # w x (imu - dvl); np.cross takes ten times as long
-        return rows.velocity[k] + swing, float(np.trace(rows.cov[k])) / 3.0
+        xx, yy, zz = cov[k].diagonal().tolist()
+        return velocity[k] + swing, (xx + yy + zz) / 3.0
+
+    def _rate_at(self, epoch_ns: int) -> list[float]:
+        """Angular rate at an epoch, body axes, rad/s."""
+        rate = self._imu.values[0]
+        imu_ns = self._imu.stamps_ns
+        i = int(imu_ns.searchsorted(epoch_ns))
+        after: list[float] = rate[min(i, len(rate) - 1)].tolist()
+        if self._hold_past or not 0 < i < len(rate):
+            return after
+        share = float((epoch_ns - imu_ns[i - 1]) / (imu_ns[i] - imu_ns[i - 1]))
+        return [w_0 + share * (w - w_0) for w_0, w in zip(rate[i - 1].tolist(), after, strict=True)]
 
     def rows(self) -> Rows:
         """Rows of both sensors that are still needed."""
@@ -280,16 +289,16 @@ class Odometry:
         newest_ns = int(epochs_ns[-1]) if len(epochs_ns) else start_ns
         before, stretch = self._kept_part(start_ns, newest_ns, removed)
 
-        new_ns = epochs_ns[epochs_ns.searchsorted(stretch.until_ns) :]
-        for k in np.flatnonzero(np.diff(new_ns) > sensors.longest_ns).tolist():
-            lost_ns = int(new_ns[k])
-            found_ns = int(new_ns[k + 1])
-            _, before = _followed(before, stretch, rows, sensors, removed, lost_ns)
-            over_gap = closed_bridge(rows, sensors, removed.after(before), lost_ns, found_ns)
-            before = _joined(before, over_gap)
-            stretch = Stretch.begin(found_ns)
         motion = None
         if stretch.until_ns < newest_ns:
+            new_ns = epochs_ns[epochs_ns.searchsorted(stretch.until_ns) :]
+            for k in np.flatnonzero(np.diff(new_ns) > sensors.longest_ns).tolist():
+                lost_ns = int(new_ns[k])
+                found_ns = int(new_ns[k + 1])
+                _, before = _followed(before, stretch, rows, sensors, removed, lost_ns)
+                over_gap = closed_bridge(rows, sensors, removed.after(before), lost_ns, found_ns)
+                before = _joined(before, over_gap)
+                stretch = Stretch.begin(found_ns)
             stretch, motion = _followed(before, stretch, rows, sensors, removed, newest_ns)
         self._kept = Kept(start_ns, removed.bias.tobytes(), removed.earth.tobytes(), before, stretch)
 

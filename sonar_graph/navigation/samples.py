@@ -1,7 +1,9 @@
 """Rows of a sensor by their stamps: storage, covariances with unmeasured directions, and checks of arguments."""
 
+from __future__ import annotations
+
 from math import isfinite
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +20,41 @@ WINDOW_NS = 5_000_000_000
 samples of 5 mm/s at 7 Hz, short enough for an accelerometer's bias not to have turned."""
 PARTIAL_M2_S2 = 0.5 * UNMEASURED_M_S**2
 """Sum of variances beyond which a direction is unmeasured."""
+
+
+class VelocityRow(NamedTuple):
+    """A velocity of the DVL's origin, body axes."""
+
+    stamp_ns: int
+    velocity: Floats
+    """Shape (3,), m/s."""
+    cov: Floats
+    """Shape (3, 3), m²/s²."""
+    is_partial: bool = False
+    """True where it leaves a direction unmeasured."""
+
+
+class VelocityRows(NamedTuple):
+    """Velocities of the DVL's origin, body axes."""
+
+    stamps_ns: Ints
+    """Shape (n,)."""
+    velocity: Floats
+    """Shape (n, 3), m/s."""
+    cov: Floats
+    """Shape (n, 3, 3), m²/s²."""
+
+    @classmethod
+    def of(cls, rows: list[VelocityRow]) -> VelocityRows:
+        """Columns of single rows."""
+        stamps_ns = np.array([row.stamp_ns for row in rows], dtype=np.int64)
+        velocity = np.array([row.velocity for row in rows]).reshape(-1, 3)
+        cov = np.array([row.cov for row in rows]).reshape(-1, 3, 3)
+        return cls(stamps_ns, velocity, cov)
+
+    def where(self, is_kept: NDArray[np.bool_]) -> VelocityRows:
+        """Some of the rows."""
+        return VelocityRows(self.stamps_ns[is_kept], self.velocity[is_kept], self.cov[is_kept])
 
 
 class StampedRows:
