@@ -39,7 +39,7 @@ from sonar_graph.navigation.preintegration import (
     motions_over,
     rows_until,
 )
-from sonar_graph.navigation.samples import WINDOW_NS, finite_vector, no_doppler_stamp
+from sonar_graph.navigation.samples import EARLIEST_NS, WINDOW_NS, finite_vector, no_doppler_stamp
 from sonar_graph.numerics import compiled
 from sonar_graph.sequence import PAUSE_NS
 from sonar_graph.states import RefusedRow
@@ -50,9 +50,8 @@ ZERO = np.zeros(3)
 class Kept(NamedTuple):
     """Part of a motion that is final, kept for the next call with the same start, bias and Earth's rotation."""
 
-    start_ns: int
-    bias: bytes
-    earth: bytes
+    key: tuple[int, bytes, bytes]
+    """Start, bias and Earth's rotation."""
     before: PreintegratedMotion | None
     """Motion until the end of the last gap; None without a gap."""
     stretch: Stretch
@@ -206,14 +205,12 @@ class Odometry:
             known_ns = end_ns
         earth = ZERO if self._earth is None or world_R_i is None else world_R_i.T @ self._earth
         removed = Removed(bias, earth)
-        epochs_ns = self.epochs(self._dvl.stamps_ns[0] - 1, min(end_ns, known_ns))
-        if len(epochs_ns):
-            lost_ns = int(epochs_ns[-1])
-            if lost_ns < start_ns < end_ns and self.is_gap(lost_ns, end_ns):
-                # both instants lie in one open gap
-                before = self._motion_since(lost_ns, start_ns, known_ns, removed, end_ns)
-                whole = self._motion_since(lost_ns, end_ns, known_ns, removed, end_ns)
-                return remaining_motion(before, whole)
+        lost_ns = self._newest_epoch(min(end_ns, known_ns))
+        if lost_ns is not None and lost_ns < start_ns < end_ns and self.is_gap(lost_ns, end_ns):
+            # both instants lie in one open gap
+            before = self._motion_since(lost_ns, start_ns, known_ns, removed, end_ns)
+            whole = self._motion_since(lost_ns, end_ns, known_ns, removed, end_ns)
+            return remaining_motion(before, whole)
         return self._motion_since(start_ns, end_ns, known_ns, removed, end_ns)
 
     def motions(self, start_ns: Ints, end_ns: Ints, known_ns: Ints, bias: Floats) -> Motions:
@@ -257,6 +254,11 @@ class Odometry:
         """First and last row (exclusive) of the epochs after one instant that are reached at another."""
         return _epochs_between(after_ns, until_ns, self._imu.stamps_ns, self._dvl.stamps_ns, self._dvl.values[2])
 
+    def _newest_epoch(self, until_ns: int) -> int | None:
+        """The newest epoch that is reached at an instant; None before the first."""
+        _, last = self._epochs_between(EARLIEST_NS, until_ns)
+        return int(self._dvl.stamps_ns[last - 1]) if last > 0 else None
+
     def _require_interval(self, start_ns: int, end_ns: int) -> None:
         """Raise MeasurementError where rows do not begin before an interval, or it is none."""
         imu_ns = self._imu.stamps_ns
@@ -287,7 +289,13 @@ class Odometry:
         epochs_ns = self.epochs(start_ns - 1, known_ns)
         epochs_ns = epochs_ns[: epochs_ns.searchsorted(end_ns, side="right")]
         newest_ns = int(epochs_ns[-1]) if len(epochs_ns) else start_ns
-        before, stretch = self._kept_part(start_ns, newest_ns, removed)
+        key = start_ns, removed.bias.tobytes(), removed.earth.tobytes()
+        kept = self._kept
+        before = None
+        stretch = Stretch.begin(start_ns)
+        if kept is not None and kept.key == key and kept.stretch.until_ns <= newest_ns:
+            before = kept.before
+            stretch = kept.stretch
 
         motion = None
         if stretch.until_ns < newest_ns:
@@ -300,7 +308,7 @@ class Odometry:
                 before = _joined(before, over_gap)
                 stretch = Stretch.begin(found_ns)
             stretch, motion = _followed(before, stretch, rows, sensors, removed, newest_ns)
-        self._kept = Kept(start_ns, removed.bias.tobytes(), removed.earth.tobytes(), before, stretch)
+        self._kept = Kept(key, before, stretch)
 
         is_lost = len(epochs_ns) > 0 and self.is_gap(newest_ns, end_ns)
         last_ns = newest_ns if is_lost else end_ns
@@ -310,14 +318,6 @@ class Odometry:
             since_lost = open_bridge(rows, sensors, removed.after(motion), newest_ns, end_ns, whole_end_ns)
             return _joined(motion, since_lost)
         return motion or motion_over(rows, sensors, removed, start_ns, start_ns)
-
-    def _kept_part(self, start_ns: int, newest_ns: int, removed: Removed) -> tuple[PreintegratedMotion | None, Stretch]:
-        """What an earlier call found out of a motion until its newest epoch at most."""
-        kept = self._kept
-        asked = start_ns, removed.bias.tobytes(), removed.earth.tobytes()
-        if kept is None or kept[:3] != asked or kept.stretch.until_ns > newest_ns:
-            return None, Stretch.begin(start_ns)
-        return kept.before, kept.stretch
 
 
 def _followed(

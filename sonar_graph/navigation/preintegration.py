@@ -76,14 +76,17 @@ class Rows(NamedTuple):
         """Rows that are known at an instant, and always the first DVL row."""
         i = self.imu_ns.searchsorted(at_ns, side="right")
         k = max(self.known_ns.searchsorted(at_ns, side="right"), 1)
-        return self._replace(
-            imu_ns=self.imu_ns[:i],
-            rate=self.rate[:i],
-            force=self.force[:i],
-            dvl_ns=self.dvl_ns[:k],
-            velocity=self.velocity[:k],
-            cov=self.cov[:k],
-            known_ns=self.known_ns[:k],
+        imu_ns, rate, force, dvl_ns, velocity, cov, known_ns, hold_past, turns = self
+        return Rows(
+            imu_ns[:i],
+            rate[:i],
+            force[:i],
+            dvl_ns[:k],
+            velocity[:k],
+            cov[:k],
+            known_ns[:k],
+            hold_past,
+            turns,
         )
 
 
@@ -162,6 +165,9 @@ def no_steps(n: int) -> Floats:
     return sums
 
 
+START = no_steps(1)
+
+
 def motions_over(rows: Rows, intervals: Intervals, sensors: Sensors, removed: Removed) -> Motions:
     """Motions over intervals, each from its own known rows."""
     sums = no_steps(len(intervals.start_ns))
@@ -184,7 +190,7 @@ class Stretch(NamedTuple):
     @classmethod
     def begin(cls, start_ns: int) -> Stretch:
         """A stretch without steps."""
-        return cls(start_ns, start_ns, no_steps(1))
+        return cls(start_ns, start_ns, START)
 
     def continued(
         self, rows: Rows, sensors: Sensors, removed: Removed, end_ns: int

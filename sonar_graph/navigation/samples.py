@@ -152,27 +152,12 @@ def finite_vector(name: str, values: ArrayLike, size: int) -> Floats:
     return found
 
 
-UNITS_NS = {"seconds": 1_000_000_000, "milliseconds": 1_000_000, "microseconds": 1_000}
-CLOSEST_SAMPLES_NS = 1_000_000
-"""No Doppler log is as quick as 1 kHz; one with stamps in microseconds looks quicker."""
-
-
 def no_doppler_stamp(name: str, instant_ns: int, stamps_ns: Ints) -> MeasurementError:
-    """Error for an epoch that is not the stamp of a Doppler row; names the nearest stamp and a likely unit."""
-    n = len(stamps_ns)
-    if n == 0:
+    """Error for an epoch that is not the stamp of a Doppler row; names the nearest stamp."""
+    if not len(stamps_ns):
         return MeasurementError(f"{name}: {instant_ns} is no Doppler stamp: there are no Doppler rows; add them first")
-    first = int(stamps_ns[0])
-    last = int(stamps_ns[-1])
-    nearest = int(stamps_ns[np.argmin(np.abs(stamps_ns - instant_ns))])
-    hint = ""
-    for unit, factor in UNITS_NS.items():
-        if instant_ns and first <= int(instant_ns) * factor <= last:
-            hint = f"; it seems to be in {unit}: times {factor} it lies among them"
-            break
-    if n > 1 and last - first < CLOSEST_SAMPLES_NS * (n - 1):
-        hint = "; the stamps are so close that they seem to be in a larger unit than nanoseconds"
+    nearest = stamps_ns[np.argmin(np.abs(stamps_ns - instant_ns))]
     return MeasurementError(
-        f"{name}: {instant_ns} is none of the {n} Doppler stamps from {first} to {last} ns; take one of"
-        f" them, the nearest is {nearest}{hint}"
+        f"{name}: {instant_ns} is none of the {len(stamps_ns)} Doppler stamps from {stamps_ns[0]} to {stamps_ns[-1]}"
+        f" ns; take one of them, the nearest is {nearest}"
     )

@@ -54,7 +54,7 @@ class InitialTilt:
     covariance: Floats
     """Of [roll, pitch, gyro bias], shape (5, 5)."""
     bias_is_observed: NDArray[np.bool_]
-    """True for the axes whose bias the data tell better than the prior, shape (3,)."""
+    """True for the axes whose bias is known better from the data than from the prior, shape (3,)."""
 
 
 def roll_and_pitch(up: Floats) -> tuple[float, float]:
@@ -65,7 +65,7 @@ def roll_and_pitch(up: Floats) -> tuple[float, float]:
 def angles_by_up(up: Floats) -> Floats:
     """Derivative of roll and pitch by up, shape (2, 3); raises AlignmentError for a nose straight up or down."""
     x, y, z = up.tolist()
-    cosine = np.hypot(y, z)
+    cosine = np.hypot(y, z)  # of pitch
     if cosine < LEAST_COSINE:
         raise AlignmentError("alignment: the nose points straight up or down, where roll has no meaning")
     by_roll = np.array([0.0, z, -y]) / cosine**2
@@ -138,12 +138,16 @@ def align_at_rest(imu: Imu, calibration: Calibration, dvl: Dvl | None = None) ->
     """
     imu = in_body_axes(imu, calibration)
     refuse_motion(imu, calibration, dvl)
-    force, rate = imu.specific_force.mean(axis=0), imu.angular_velocity.mean(axis=0)
+    force = imu.specific_force.mean(axis=0)
+    rate = imu.angular_velocity.mean(axis=0)
     up = force / np.linalg.norm(force)
     upward, _ = earth_up_and_level(calibration)
-    length_s = float(imu.stamps_ns[-1] - imu.stamps_ns[0]) * 1e-9 * len(imu) / (len(imu) - 1)  # n samples, n intervals
+    span_s = float(imu.stamps_ns[-1] - imu.stamps_ns[0]) * 1e-9
+    length_s = span_s * len(imu) / (len(imu) - 1)  # n samples stand for n intervals
+    roll, pitch = roll_and_pitch(up)
+    bias = rate - upward * up
     cov = covariance_at_rest(up, length_s, calibration)
-    return InitialTilt(int(imu.stamps_ns[-1]), *roll_and_pitch(up), rate - upward * up, cov, np.ones(3, dtype=np.bool_))
+    return InitialTilt(int(imu.stamps_ns[-1]), roll, pitch, bias, cov, np.ones(3, dtype=np.bool_))
 
 
 def covariance_at_rest(up: Floats, rest_s: float, calibration: Calibration) -> Floats:
@@ -152,7 +156,8 @@ def covariance_at_rest(up: Floats, rest_s: float, calibration: Calibration) -> F
     ``up``: unit vector ``body_R_world e_z``, shape (3,).
     """
     upward, level = earth_up_and_level(calibration)
-    sensors, across = calibration.imu, np.eye(3) - np.outer(up, up)
+    sensors = calibration.imu
+    across = np.eye(3) - np.outer(up, up)
     tilt = (sensors.accel_bias_sigma**2 + sensors.accel_noise_density**2 / rest_s) / calibration.gravity_m_s2**2
     by_up = np.concatenate([angles_by_up(up), -upward * np.eye(3)])
     covariance = by_up @ (tilt * across) @ by_up.T
@@ -175,10 +180,11 @@ def refuse_motion(imu: Imu, calibration: Calibration, dvl: Dvl | None) -> None:
         ("angular_velocity", imu.angular_velocity, "gyro_noise_density"),
     ):
         density = getattr(calibration.imu, field)
-        means = (np.add.reduceat(values, first, axis=0) / count[:, None])[:-1]
+        means = (np.add.reduceat(values, first, axis=0) / count[:, None])[:-1]  # the last block is not full
         freedom = means.size - means.shape[1]
         ratio = np.sqrt(np.sum((means - means.mean(axis=0)) ** 2) * BLOCK_S / freedom)
-        if ratio > LARGEST_NOISE_RATIO * np.sqrt(chi_square_exceeded(FALSE_ALARM, freedom) / freedom) * density:
+        by_chance = np.sqrt(chi_square_exceeded(FALSE_ALARM, freedom) / freedom)
+        if ratio > LARGEST_NOISE_RATIO * by_chance * density:
             raise AlignmentError(
                 f"Imu.{name}: varies as a density of {ratio:.2g}, not imu.{field} = {density:.2g}; "
                 "the vehicle moved (give another stretch, or align in motion), or the density is too small"
@@ -188,7 +194,8 @@ def refuse_motion(imu: Imu, calibration: Calibration, dvl: Dvl | None) -> None:
         raise AlignmentError(
             f"Imu.angular_velocity: turns at {rate:.3f} rad/s on average; no rest, give another stretch"
         )
-    force, gravity = float(np.linalg.norm(imu.specific_force.mean(axis=0))), calibration.gravity_m_s2
+    force = float(np.linalg.norm(imu.specific_force.mean(axis=0)))
+    gravity = calibration.gravity_m_s2
     if abs(force / gravity - 1.0) > LARGEST_GRAVITY_ERROR:
         raise AlignmentError(
             f"Imu.specific_force: {force:.2f} m/s² on average, not {gravity:.2f}; "

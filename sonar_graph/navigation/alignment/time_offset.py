@@ -1,8 +1,8 @@
 """Time offset at which two sensors agree best, with its uncertainty or the reason why it is not known.
 
-Over a grid of offsets the data are lined up anew and fitted; Gauss-Newton steps around the best offset give its value
+Over a grid of offsets the data are lined up again and fitted; Gauss-Newton steps around the best offset give its value
 and covariance together with the other parameters. A second minimum that fits nearly as well, or a best offset at the
-end of the range, means that the motion does not tell it.
+end of the range, means that the motion does not determine it.
 
 The data are stretches: runs of m differences ``y_k = x_{k+1} - x_k`` over durations T_k, three axes each, with::
 
@@ -70,7 +70,7 @@ def fit(stretches: Sequence[SampleSeries], prior_sigmas: Floats, ratios: Floats 
     """Fit the common parameters.
 
     ``stretches``: at least one, with more differences in all than parameters. ``prior_sigmas``: of the common
-    parameters about zero, shape (p,), so wide that they matter only where the data say nothing; a parameter whose
+    parameters about zero, shape (p,), so wide that they matter only where the data determine nothing; a parameter whose
     covariance is the prior's was not observed. ``ratios``: of the noises; None: estimated from the data.
     """
     if ratios is None:
@@ -109,7 +109,8 @@ def rate_noise_power(stretches: Sequence[SampleSeries], ratios: Floats) -> float
         own, _ = _orthonormal(np.concatenate([_whitened(factors[axis], stretch.B[:, axis]) for axis in range(3)]))
         power = 3.0 * m - own.shape[1]
         for axis in range(3):
-            of_samples, basis = _whitened(factors[axis], differences), own[axis * m : (axis + 1) * m]
+            of_samples = _whitened(factors[axis], differences)
+            basis = own[axis * m : (axis + 1) * m]
             power -= float(np.sum(of_samples**2) - np.sum((basis.T @ of_samples) ** 2))
         powers.append(power)
     return sum(powers)
@@ -118,7 +119,8 @@ def rate_noise_power(stretches: Sequence[SampleSeries], ratios: Floats) -> float
 def _factors(stretch: SampleSeries, ratios: Floats) -> list[Floats]:
     """Cholesky factor of K, shape (m, m), for each axis."""
     T = stretch.duration_s
-    m, middle = len(T), np.cumsum(T) - 0.5 * T
+    m = len(T)
+    middle = np.cumsum(T) - 0.5 * T
     walk = np.outer(T, T) * np.minimum.outer(middle, middle)
     steady = np.diag(2.0 + ratios[0] * T) - np.eye(m, k=1) - np.eye(m, k=-1)
     by_kind = {walks: np.linalg.cholesky(steady + walks * ratios[1] * walk) for walks in set(stretch.walks)}
@@ -147,12 +149,12 @@ class NormalEquations:
         parts = []
         for stretch in stretches:
             m, _, p = stretch.A.shape
-            columns = np.concatenate([stretch.y[:, :, None], stretch.A, stretch.B], axis=2)
+            columns = np.concatenate([stretch.y[:, :, None], stretch.A, stretch.B], axis=2)  # (m, 3, 1 + p + q)
             factors = _factors(stretch, ratios)
-            white = np.concatenate([_whitened(factors[axis], columns[:, axis]) for axis in range(3)])
+            white = np.concatenate([_whitened(factors[axis], columns[:, axis]) for axis in range(3)])  # (3 m, ...)
             own, size = _orthonormal(white[:, 1 + p :])
             kept = white[:, : 1 + p] - own @ (own.T @ white[:, : 1 + p])
-            squares = kept.T @ kept
+            squares = kept.T @ kept  # of [y, A], (1 + p, 1 + p)
             size = 2.0 * sum(float(np.log(np.diag(factor)).sum()) for factor in factors) + size
             parts.append((squares, 3 * m - own.shape[1], size))
         squares = [part[0] for part in parts]
@@ -218,7 +220,7 @@ class Estimate1D:
 
     @property
     def is_known(self) -> bool:
-        """True where the log tells the number."""
+        """True where the number is known."""
         return not self.reason
 
     def limited(self, sigma_limit: float, reason: str) -> Estimate1D:
@@ -266,7 +268,7 @@ def search_offset(line_up: LineUp, prior_sigmas: Floats) -> OffsetFit:
     offset_s = float(grid[best])
     limits = offset_s - 2 * GRID_STEP_S, offset_s + 2 * GRID_STEP_S
     sigmas = np.concatenate([[PRIOR_OFFSET_S], prior_sigmas])
-    # The ratios of the grid, up to half a step off the best offset, take motion that is not lined up for noise.
+    # ratios of the grid are up to half a step off the best offset: what is not lined up there counts as noise
     offset_s = _converge(line_up, prior_sigmas, ratios, offset_s, limits).offset_s
     ratios = fit(_with_offset(line_up, offset_s, prior_sigmas, ratios), sigmas).ratios
     found = _converge(line_up, prior_sigmas, ratios, offset_s, limits)
@@ -298,8 +300,8 @@ def _converge(
             break
     sigma_s = float(np.sqrt(found.covariance[0, 0]))
     is_settled = abs(float(found.parameters[0])) < max(SETTLED_SIGMAS * sigma_s, 1e-5)
-    told = f"it does not settle: after {ROUNDS} steps near {offset_s:+.2f} s the next is {step:+.2g} s"
-    return OffsetFit(found, offset_s, "" if is_settled else told)
+    unsettled = f"it does not settle: after {ROUNDS} steps near {offset_s:+.2f} s the next is {step:+.2g} s"
+    return OffsetFit(found, offset_s, "" if is_settled else unsettled)
 
 
 def _with_offset(line_up: LineUp, offset_s: float, prior_sigmas: Floats, ratios: Floats) -> list[SampleSeries]:

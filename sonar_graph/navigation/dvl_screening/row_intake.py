@@ -155,7 +155,7 @@ class RowIntake:
         return was_placed_before
 
     def _sound_velocities(self, dvl: Dvl) -> VelocityRows | None:
-        """Rows in time whose covariance is positive definite, with the scale removed, in body axes; None without any."""
+        """Rows in time with a positive definite covariance, without the scale error, in body axes; None without any."""
         rows = self._in_time(dvl, self.dvl.stamps_ns, "dvl")
         if rows is None:
             return None
