@@ -45,6 +45,7 @@ from sonar_graph.numerics import (
     diagonal,
     exp_and_mean,
     inlined,
+    mat,
     skew,
     store,
     store6,
@@ -267,14 +268,14 @@ def add_steps(
         imu_rows = rows_until(rows.imu_ns, known)
         dvl_rows = max(rows_until(rows.known_ns, known), 1)
         at = SIZE * e
-        R = block(sums, at)
+        R = mat(sums, (at, 0))
         p = row_of(sums, at + P)
         impulse = row_of(sums, at + IMPULSE)
-        tt = block(sums, at + TT)
-        rt = block(sums, at + RT)
-        rr = block(sums, at + RR)
-        D_t = block(sums, at + D_T)
-        D_r = block(sums, at + D_R)
+        tt = mat(sums, (at + TT, 0))
+        rt = mat(sums, (at + RT, 0))
+        rr = mat(sums, (at + RR, 0))
+        D_t = mat(sums, (at + D_T, 0))
+        D_r = mat(sums, (at + D_R, 0))
         if has_gap(rows.dvl_ns, dvl_rows, k, t, end, intervals.longest_ns):
             t = end
             R = np.nan * I3
@@ -310,14 +311,14 @@ def add_steps(
                 impulse += dt * (R_k @ step.force)
                 p += s  # (5)
                 R = R @ turn  # (6)
-        put_block(R, sums, at)
+        store(R, sums, (at, 0))
         put(p, sums, at + P)
         put(impulse, sums, at + IMPULSE)
-        put_block(tt, sums, at + TT)
-        put_block(rt, sums, at + RT)
-        put_block(rr, sums, at + RR)
-        put_block(D_t, sums, at + D_T)
-        put_block(D_r, sums, at + D_R)
+        store(tt, sums, (at + TT, 0))
+        store(rt, sums, (at + RT, 0))
+        store(rr, sums, (at + RR, 0))
+        store(D_t, sums, (at + D_T, 0))
+        store(D_r, sums, (at + D_R, 0))
         to_j = Mat6(R.T, O3, -1.0 * (R.T @ skew(p)), R.T)  # Ad of the inverse of (R, p)
         store6(to_j @ Mat6(tt, rt.T, rt, rr) @ to_j.T, C[e])
         store(to_j.a @ D_t, D[e])
@@ -414,12 +415,6 @@ def row_of(A: Floats, k: int) -> Vec3:
 
 
 @inlined
-def block(A: Floats, k: int) -> Mat3:
-    """Matrix of three rows from k on, of an array of shape (n, 3)."""
-    return Mat3(row_of(A, k), row_of(A, k + 1), row_of(A, k + 2))
-
-
-@inlined
 def covariance(A: Floats, k: int) -> Mat3:
     """Matrix k of an array of shape (n, 3, 3)."""
     return Mat3(
@@ -435,11 +430,3 @@ def put(v: Vec3, out: Floats, k: int) -> None:
     out[k, 0] = v.x
     out[k, 1] = v.y
     out[k, 2] = v.z
-
-
-@inlined
-def put_block(A: Mat3, out: Floats, k: int) -> None:
-    """Write what `block` reads."""
-    put(A.x, out, k)
-    put(A.y, out, k + 1)
-    put(A.z, out, k + 2)

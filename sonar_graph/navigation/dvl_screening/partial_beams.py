@@ -63,7 +63,8 @@ class InertialRows(NamedTuple):
         """The rows for an interval, none after it; None where a force was not measured in it."""
         first = max(int(np.searchsorted(self.stamps_ns, first_ns, side="right")) - 1, 0)
         known = int(np.searchsorted(self.stamps_ns, last_ns, side="right"))
-        within = InertialRows(*(column[first:known] for column in self))
+        rows = slice(first, known)
+        within = InertialRows(self.stamps_ns[rows], self.rate[rows], self.specific_force[rows])
         # what is a hole depends on intervals before the first of these rows as well
         with_hole = row_after_hole(self.stamps_ns, first, known - 1, UNFELT_NS) >= 0
         if with_hole or not len(within.stamps_ns) or not np.isfinite(within.specific_force).all():
