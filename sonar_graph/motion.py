@@ -57,8 +57,14 @@ class PreintegratedMotion:
 
         ``i_T_k = i_T_j j_T_k``; a perturbation of the first reaches frame k through ``Ad(j_T_k^-1)``.
         """
+        # over no time nothing moves, and there is no mean force
+        if self.duration_s == 0.0:
+            return next_motion
+        if next_motion.duration_s == 0.0:
+            return self
         A = next_motion.i_T_j.inverse().AdjointMap()
-        i_R_j, duration_s = self.i_T_j.rotation().matrix(), self.duration_s + next_motion.duration_s
+        i_R_j = self.i_T_j.rotation().matrix()
+        duration_s = self.duration_s + next_motion.duration_s
         impulse = self.mean_specific_force * self.duration_s
         impulse += i_R_j @ next_motion.mean_specific_force * next_motion.duration_s
         return PreintegratedMotion(

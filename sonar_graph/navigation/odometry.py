@@ -35,7 +35,6 @@ from sonar_graph.navigation.preintegration import (
     Rows,
     Sensors,
     Stretch,
-    motion_over,
     motions_over,
     rows_until,
 )
@@ -52,10 +51,8 @@ class Kept(NamedTuple):
 
     key: tuple[int, bytes, bytes]
     """Start, bias and Earth's rotation."""
-    before: PreintegratedMotion | None
-    """Motion until the end of the last gap; None without a gap."""
     stretch: Stretch
-    """Sums of the steps since then."""
+    """From the start, or from the end of the last gap, with the motion before it."""
 
 
 class Odometry:
@@ -289,55 +286,27 @@ class Odometry:
         epochs_ns = self.epochs(start_ns - 1, known_ns)
         epochs_ns = epochs_ns[: epochs_ns.searchsorted(end_ns, side="right")]
         newest_ns = int(epochs_ns[-1]) if len(epochs_ns) else start_ns
+        stretch = Stretch.begin(start_ns, removed.bias)
         key = start_ns, removed.bias.tobytes(), removed.earth.tobytes()
         kept = self._kept
-        before = None
-        stretch = Stretch.begin(start_ns)
         if kept is not None and kept.key == key and kept.stretch.until_ns <= newest_ns:
-            before = kept.before
             stretch = kept.stretch
 
-        motion = None
         if stretch.until_ns < newest_ns:
             new_ns = epochs_ns[epochs_ns.searchsorted(stretch.until_ns) :]
             for k in np.flatnonzero(np.diff(new_ns) > sensors.longest_ns).tolist():
                 lost_ns = int(new_ns[k])
                 found_ns = int(new_ns[k + 1])
-                _, before = _followed(before, stretch, rows, sensors, removed, lost_ns)
+                before = stretch.continued(rows, sensors, removed, lost_ns).motion
                 over_gap = closed_bridge(rows, sensors, removed.after(before), lost_ns, found_ns)
-                before = _joined(before, over_gap)
-                stretch = Stretch.begin(found_ns)
-            stretch, motion = _followed(before, stretch, rows, sensors, removed, newest_ns)
-        self._kept = Kept(key, before, stretch)
+                stretch = Stretch.begin(found_ns, removed.bias, before.then(over_gap))
+            stretch = stretch.continued(rows, sensors, removed, newest_ns)
+        self._kept = Kept(key, stretch)
 
-        is_lost = len(epochs_ns) > 0 and self.is_gap(newest_ns, end_ns)
-        last_ns = newest_ns if is_lost else end_ns
-        if motion is None or last_ns > newest_ns:
-            _, motion = _followed(before, stretch, rows, sensors, removed, last_ns)
-        if is_lost:
-            since_lost = open_bridge(rows, sensors, removed.after(motion), newest_ns, end_ns, whole_end_ns)
-            return _joined(motion, since_lost)
-        return motion or motion_over(rows, sensors, removed, start_ns, start_ns)
-
-
-def _followed(
-    before: PreintegratedMotion | None,
-    stretch: Stretch,
-    rows: Rows,
-    sensors: Sensors,
-    removed: Removed,
-    end_ns: int,
-) -> tuple[Stretch, PreintegratedMotion | None]:
-    """A stretch continued to an instant, and the motion before, or none, followed by it; none if nothing passed."""
-    if stretch.start_ns == end_ns:
-        return stretch, before
-    stretch, motion = stretch.continued(rows, sensors, removed.after(before), end_ns)
-    return stretch, _joined(before, motion)
-
-
-def _joined(before: PreintegratedMotion | None, motion: PreintegratedMotion) -> PreintegratedMotion:
-    """A motion, or none, followed by another."""
-    return motion if before is None else before.then(motion)
+        if len(epochs_ns) and self.is_gap(newest_ns, end_ns):
+            before = stretch.motion
+            return before.then(open_bridge(rows, sensors, removed.after(before), newest_ns, end_ns, whole_end_ns))
+        return stretch.continued(rows, sensors, removed, end_ns).motion
 
 
 @compiled

@@ -181,33 +181,46 @@ def motions_over(rows: Rows, intervals: Intervals, sensors: Sensors, removed: Re
 
 
 class Stretch(NamedTuple):
-    """Sums from one instant to another, to be continued."""
+    """Sums of the steps from one instant to another, to be continued, and the motion before them."""
 
     start_ns: int
     until_ns: int
+    bias: Floats
+    """Gyro bias that is removed, shape (3,), rad/s."""
+    before: PreintegratedMotion | None
+    """Motion until the start of the sums; None for a motion that begins there."""
     sums: Floats
     """Shape (1, 20, 3)."""
+    C: Floats
+    """Covariance over the sums, shape (6, 6)."""
+    D: Floats
+    """Derivative by the bias over the sums, shape (6, 3)."""
 
     @classmethod
-    def begin(cls, start_ns: int) -> Stretch:
+    def begin(cls, start_ns: int, bias: Floats, before: PreintegratedMotion | None = None) -> Stretch:
         """A stretch without steps."""
-        return cls(start_ns, start_ns, START)
+        return cls(start_ns, start_ns, bias, before, START, np.zeros((6, 6)), np.zeros((6, 3)))
 
-    def continued(
-        self, rows: Rows, sensors: Sensors, removed: Removed, end_ns: int
-    ) -> tuple[Stretch, PreintegratedMotion]:
-        """The stretch until a later instant, and the motion over it; the Earth's rotation is that in its first frame.
+    def continued(self, rows: Rows, sensors: Sensors, removed: Removed, end_ns: int) -> Stretch:
+        """The stretch until a later instant.
 
         Velocities are linear or held however far apart the samples are: gaps are for the caller to find.
         """
+        if end_ns == self.until_ns:
+            return self
         intervals = Intervals(np.array([self.until_ns]), np.array([end_ns]), LATEST, LATEST_NS)
         sums = self.sums.copy()
-        C, D = add_steps(rows, intervals, sensors, removed, sums.reshape(-1, 3))
-        i_T_j = gtsam.Pose3(gtsam.Rot3(sums[0, :3]), sums[0, P])
-        duration_s = (end_ns - self.start_ns) * 1e-9
-        mean_force = sums[0, IMPULSE] / duration_s if duration_s > 0 else np.full(3, np.nan)
-        motion = PreintegratedMotion(i_T_j, C[0], D[0], removed.bias, duration_s, mean_force)
-        return Stretch(self.start_ns, end_ns, sums), motion
+        C, D = add_steps(rows, intervals, sensors, removed.after(self.before), sums.reshape(-1, 3))
+        return Stretch(self.start_ns, end_ns, self.bias, self.before, sums, C[0], D[0])
+
+    @property
+    def motion(self) -> PreintegratedMotion:
+        """The motion before the sums and over them."""
+        i_T_j = gtsam.Pose3(gtsam.Rot3(self.sums[0, :3]), self.sums[0, P])
+        T = (self.until_ns - self.start_ns) * 1e-9
+        mean_force = self.sums[0, IMPULSE] / T if T > 0 else np.full(3, np.nan)
+        motion = PreintegratedMotion(i_T_j, self.C, self.D, self.bias, T, mean_force)
+        return motion if self.before is None else self.before.then(motion)
 
 
 LATEST = np.array([LATEST_NS])
@@ -215,7 +228,7 @@ LATEST = np.array([LATEST_NS])
 
 def motion_over(rows: Rows, sensors: Sensors, removed: Removed, start_ns: int, end_ns: int) -> PreintegratedMotion:
     """Motion between two instants by linear or held velocities, however far apart the samples are."""
-    return Stretch.begin(start_ns).continued(rows, sensors, removed, end_ns)[1]
+    return Stretch.begin(start_ns, removed.bias).continued(rows, sensors, removed, end_ns).motion
 
 
 class Step(NamedTuple):
