@@ -113,7 +113,8 @@ def open_bridge(
     t = (dvl_ns[samples] - start_ns) * 1e-9
     if len(t) >= FEWEST and -t[0] >= SHORTEST_S:
         off = t - t.mean()
-        weights_s = T * (1.0 / len(t) + (0.5 * T - t.mean()) * off / (off @ off))
+        slope = (0.5 * T - t.mean()) * off / (off @ off)
+        weights_s = T * (1.0 / len(t) + slope)
         motion = _by_accelerometers(rows, sensors, removed, LineFit(samples, weights_s, weights_s**2), end_ns)
         if motion is not None:
             return motion
@@ -139,6 +140,7 @@ def _by_accelerometers(
     is_closed = bool(cuts_ns[-1] == end_ns)
     weights_s = fit.weights_s
     lever = sensors.body_p_dvl - sensors.body_p_imu
+    # (n, 3), the same numbers however many rows come before and after
     rate = np.column_stack([np.interp(cuts_ns, rows.imu_ns, column) for column in rows.rate.T])
     velocity = rows.velocity[fit.samples] - np.cross(rate - removed.bias, lever)  # of the IMU's point, (n, 3)
     turned = weights_s[:, None] * velocity
@@ -168,20 +170,26 @@ def _by_accelerometers(
 
     # x = y - way after the epoch, y before it
     y = np.array(sums.y)
-    xx = np.array(sums.yy) - np.outer(way, y) - np.outer(y, way) + T * np.outer(way, way)
-    xR = np.array(sums.yR) - gtsam.SO3.Hat(way) @ np.array(sums.R_after)
+    mixed = np.outer(way, y)
+    xx = np.array(sums.yy) - mixed - mixed.T + T * np.outer(way, way)  # (3, 3)
+    R_after = np.array(sums.R_after)
+    xR = np.array(sums.yR) - gtsam.SO3.Hat(way) @ R_after  # (3, 3)
     D_accel = -np.array(sums.aR)
     cov_s_theta = n_g2 * gtsam.SO3.Hat(y - T * way)
     # (2): [x]x [x]x^T = |x|^2 I - x x^T
-    cov_s = n_g2 * (np.trace(xx) * np.eye(3) - xx.T) + sensors.accel_density**2 * sums.aa * np.eye(3)
+    cov_s = n_g2 * (np.trace(xx) * np.eye(3) - xx.T)
+    cov_s += sensors.accel_density**2 * sums.aa * np.eye(3)
     cov_s += sensors.accel_bias_sigma**2 * D_accel @ D_accel.T
-    cov_s += np.tensordot(fit.squares_s2, R_k @ rows.cov[fit.samples] @ R_k.transpose(0, 2, 1), 1)
+    of_samples = R_k @ rows.cov[fit.samples] @ R_k.transpose(0, 2, 1)  # (n, 3, 3)
+    cov_s += np.tensordot(fit.squares_s2, of_samples, 1)
     C_i = np.block([[n_g2 * T * np.eye(3), cov_s_theta.T], [cov_s_theta, cov_s]])
-    D_i = np.vstack([-np.array(sums.R_after), -xR - swung_s @ gtsam.SO3.Hat(lever)])
+    # (3); the gyro bias also turns the samples about the IMU's point
+    D_i = np.vstack([-R_after, -xR - swung_s @ gtsam.SO3.Hat(lever)])
     to_j = np.kron(np.eye(2), R.T)
     C = to_j @ C_i @ to_j.T
     i_T_j = gtsam.Pose3(gtsam.Rot3(R), way + sensors.body_p_imu)
-    return PreintegratedMotion(i_T_j, 0.5 * (C + C.T), to_j @ D_i, removed.bias, T, np.array(sums.v) / T)
+    mean_force = np.array(sums.v) / T
+    return PreintegratedMotion(i_T_j, 0.5 * (C + C.T), to_j @ D_i, removed.bias, T, mean_force)
 
 
 def _turn_until(rows: Rows, sensors: Sensors, removed: Removed, first_ns: int, epoch_ns: int) -> Floats:
@@ -265,6 +273,7 @@ def sum_along(rows: Rows, imu_rows: int, line: Line, removed: Removed) -> LineSu
                 f = NOWHERE
             turn, mean = exp_and_mean(dt * w_k)
             R_k = R @ mean
+            # before the origin a step turns the samples of the window, not the motion
             after = 1.0 if middle > line.origin_ns else 0.0
             a = line.W[k] - after * ((middle - line.origin_ns) * 1e-9)
             F = dt * (R_k @ f)

@@ -200,6 +200,7 @@ class Odometry:
         self._require_interval(start_ns, end_ns)
         if known_ns is None:
             known_ns = end_ns
+        # without an attitude the Earth's rotation in frame i is not known
         earth = ZERO if self._earth is None or world_R_i is None else world_R_i.T @ self._earth
         removed = Removed(bias, earth)
         lost_ns = self._newest_epoch(min(end_ns, known_ns))
@@ -303,6 +304,7 @@ class Odometry:
             stretch = stretch.continued(rows, sensors, removed, newest_ns)
         self._kept = Kept(key, stretch)
 
+        # from the newest epoch on: provisional, and not kept
         if len(epochs_ns) and self.is_gap(newest_ns, end_ns):
             before = stretch.motion
             return before.then(open_bridge(rows, sensors, removed.after(before), newest_ns, end_ns, whole_end_ns))

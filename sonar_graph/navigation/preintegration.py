@@ -137,7 +137,9 @@ class Removed(NamedTuple):
 
     def after(self, motion: PreintegratedMotion | None) -> Removed:
         """The same, with the Earth's rotation in the last frame of a motion."""
-        return self if motion is None else Removed(self.bias, motion.i_T_j.rotation().unrotate(self.earth))
+        if motion is None:
+            return self
+        return Removed(self.bias, motion.i_T_j.rotation().unrotate(self.earth))
 
 
 class Intervals(NamedTuple):
@@ -154,7 +156,13 @@ class Intervals(NamedTuple):
 SIZE = 20
 """Rows of the sums of one interval, each a vector of three: R (3), p, impulse, then three rows each of the blocks
 tt, rt and rr of C_i (rotation, lower left, translation) and of the two blocks of D_i."""
-P, IMPULSE, TT, RT, RR, D_T, D_R = 3, 4, 5, 8, 11, 14, 17
+P = 3
+IMPULSE = 4
+TT = 5
+RT = 8
+RR = 11
+D_T = 14
+D_R = 17
 
 
 def no_steps(n: int) -> Floats:
@@ -210,15 +218,18 @@ class Stretch(NamedTuple):
             return self
         intervals = Intervals(np.array([self.until_ns]), np.array([end_ns]), LATEST, LATEST_NS)
         sums = self.sums.copy()
-        C, D = add_steps(rows, intervals, sensors, removed.after(self.before), sums.reshape(-1, 3))
+        # the Earth's rotation is known in the frame where the motion begins
+        here = removed.after(self.before)
+        C, D = add_steps(rows, intervals, sensors, here, sums.reshape(-1, 3))
         return Stretch(self.start_ns, end_ns, self.bias, self.before, sums, C[0], D[0])
 
     @property
     def motion(self) -> PreintegratedMotion:
         """The motion before the sums and over them."""
-        i_T_j = gtsam.Pose3(gtsam.Rot3(self.sums[0, :3]), self.sums[0, P])
+        sums = self.sums[0]
+        i_T_j = gtsam.Pose3(gtsam.Rot3(sums[:3]), sums[P])
         T = (self.until_ns - self.start_ns) * 1e-9
-        mean_force = self.sums[0, IMPULSE] / T if T > 0 else np.full(3, np.nan)
+        mean_force = sums[IMPULSE] / T if T > 0 else np.full(3, np.nan)
         motion = PreintegratedMotion(i_T_j, self.C, self.D, self.bias, T, mean_force)
         return motion if self.before is None else self.before.then(motion)
 

@@ -77,6 +77,7 @@ class StampedRows:
         end = n + len(stamps_ns)
         comes_after = not n or bool(stamps_ns[0] > self.stamps_ns[-1])
         columns = self._columns
+        # four times the room, so that appending copies each row less than once
         if end > len(columns[0]):
             columns = [_with_room(old, n, 4 * end) for old in columns]
         shown: list[NDArray[Any]] = []

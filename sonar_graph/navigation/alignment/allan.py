@@ -53,9 +53,11 @@ def allan_deviation(samples: Floats, together: int) -> Floats:
 
 def degrees_of_freedom(count: int, together: int) -> float:
     """Equivalent degrees of freedom of the overlapping deviation of white noise, over ``together`` samples."""
-    n = count + 1
+    n = count + 1  # N' of the module's equation
     m = together
-    return (3 * (n - 1) / (2 * m) - 2 * (n - 2) / n) * 4 * m**2 / (4 * m**2 + 5)
+    by_means = 3 * (n - 1) / (2 * m)
+    by_ends = 2 * (n - 2) / n
+    return (by_means - by_ends) * 4 * m**2 / (4 * m**2 + 5)
 
 
 def density(samples: Floats, rate_hz: float) -> Estimate1D:
@@ -91,20 +93,23 @@ def noise_densities(imu: Imu) -> NoiseDensities:
 
 def longest_rest(imu: Imu) -> slice:
     """The longest run of rows in which the means over a second hardly change."""
-    second = ((imu.stamps_ns - imu.stamps_ns[0]) * (1e-9 / WINDOW_S)).astype(np.int64)
+    since_ns = imu.stamps_ns - imu.stamps_ns[0]
+    second = (since_ns * (1e-9 / WINDOW_S)).astype(np.int64)
     names, first, count = np.unique(second, return_index=True, return_counts=True)
     still = _steady(imu.angular_velocity, first, count, GYRO_MOTION_RAD_S)
     if np.isfinite(imu.specific_force).all():
         still &= _steady(imu.specific_force, first, count, ACCEL_MOTION_M_S2)
     still[1:] &= np.diff(names) == 1  # a hole in the log is no rest
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(int), [0]])))
+    bordered = np.concatenate([[0], still.astype(int), [0]])
+    edges = np.flatnonzero(np.diff(bordered))  # where rest begins and ends, in turn
     if not len(edges):
         return slice(0, 0)
     begins = edges[::2]
     ends = edges[1::2]
     longest = int(np.argmax(ends - begins))
+    begin = begins[longest]
     last = ends[longest] - 1
-    return slice(int(first[begins[longest]]), int(first[last] + count[last]))
+    return slice(int(first[begin]), int(first[last] + count[last]))
 
 
 def _steady(values: Floats, first: Ints, count: Ints, least: float) -> NDArray[np.bool_]:

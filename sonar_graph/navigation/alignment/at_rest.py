@@ -59,7 +59,10 @@ class InitialTilt:
 
 def roll_and_pitch(up: Floats) -> tuple[float, float]:
     """Roll and pitch (rad) from the world's up in body axes, of any length, shape (3,)."""
-    return float(np.arctan2(up[1], up[2])), float(np.arctan2(-up[0], np.hypot(up[1], up[2])))
+    x, y, z = up.tolist()
+    roll = np.arctan2(y, z)
+    pitch = np.arctan2(-x, np.hypot(y, z))
+    return float(roll), float(pitch)
 
 
 def angles_by_up(up: Floats) -> Floats:
@@ -76,7 +79,10 @@ def angles_by_up(up: Floats) -> Floats:
 def earth_up_and_level(calibration: Calibration) -> tuple[float, float]:
     """Earth's rate along up and along north, rad/s; zero without a latitude."""
     earth = earth_rate_in_world(calibration)
-    return (0.0, 0.0) if earth is None else (float(earth[2]), float(earth[1]))
+    if earth is None:
+        return 0.0, 0.0
+    _, north, up = earth.tolist()
+    return up, north
 
 
 def in_body_axes(imu: Imu, calibration: Calibration) -> Imu:
@@ -182,7 +188,8 @@ def refuse_motion(imu: Imu, calibration: Calibration, dvl: Dvl | None) -> None:
         density = getattr(calibration.imu, field)
         means = (np.add.reduceat(values, first, axis=0) / count[:, None])[:-1]  # the last block is not full
         freedom = means.size - means.shape[1]
-        ratio = np.sqrt(np.sum((means - means.mean(axis=0)) ** 2) * BLOCK_S / freedom)
+        squares = np.sum((means - means.mean(axis=0)) ** 2)
+        ratio = np.sqrt(squares * BLOCK_S / freedom)
         by_chance = np.sqrt(chi_square_exceeded(FALSE_ALARM, freedom) / freedom)
         if ratio > LARGEST_NOISE_RATIO * by_chance * density:
             raise AlignmentError(
@@ -201,7 +208,9 @@ def refuse_motion(imu: Imu, calibration: Calibration, dvl: Dvl | None) -> None:
             f"Imu.specific_force: {force:.2f} m/s² on average, not {gravity:.2f}; "
             "check its unit, and that gravity is in it"
         )
-    during = None if dvl is None else dvl.between(int(imu.stamps_ns[0]) - 1, int(imu.stamps_ns[-1]))
+    if dvl is None:
+        return
+    during = dvl.between(int(imu.stamps_ns[0]) - 1, int(imu.stamps_ns[-1]))
     if during is not None:
         speed = float(np.linalg.norm(during.velocity.mean(axis=0)))
         sigma = float(np.linalg.norm(calibration.dvl.velocity_sigma_m_s)) / np.sqrt(len(during))

@@ -78,13 +78,16 @@ class InertialPath:
         earliest = seconds - margin_s
         latest = seconds + margin_s
         inside = (earliest >= 0) & (latest <= self.seconds[-1])
-        before = np.clip(np.searchsorted(self.seconds, earliest, side="right") - 1, 0, None)
-        after = np.clip(np.searchsorted(self.seconds, latest), None, len(self.seconds) - 1)
+        last_before = np.searchsorted(self.seconds, earliest, side="right") - 1
+        first_after = np.searchsorted(self.seconds, latest)
+        before = np.maximum(last_before, 0)
+        after = np.minimum(first_after, len(self.seconds) - 1)
         return np.asarray(inside & (self.parts[before] == self.parts[after]))
 
     def parts_at(self, seconds: Floats) -> Ints:
         """Number of holes that have ended before each instant, shape (k,)."""
-        return np.asarray(self.parts[np.clip(np.searchsorted(self.seconds, seconds, side="right") - 1, 0, None)])
+        last_before = np.searchsorted(self.seconds, seconds, side="right") - 1
+        return np.asarray(self.parts[np.maximum(last_before, 0)])
 
     def rotations_at(self, seconds: Floats) -> Floats:
         """C at instants within the samples, along the shortest arc between two, shape (k, 3, 3)."""
@@ -113,14 +116,17 @@ def holes_before(stamps_ns: Ints) -> Ints:
 
 def strapdown_integrals(seconds: Floats, rate: Floats, force: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     """C, F, S and P of the module's equations at every sample."""
-    turns = 0.5 * (rate[:-1] + rate[1:]) * np.diff(seconds)[:, None]
+    mean_rate = 0.5 * (rate[:-1] + rate[1:])
+    turns = mean_rate * np.diff(seconds)[:, None]  # (n - 1, 3)
     from scipy.integrate import cumulative_trapezoid  # takes most of a second to load
 
     integral = partial(cumulative_trapezoid, x=seconds, axis=0, initial=0.0)
-    C = running_rotations(turns)
+    C = running_rotations(turns)  # (n, 3, 3)
     felt = C @ force[:, :, None]
+    F = integral(felt[:, :, 0])
     S = integral(C)
-    return C, integral(felt[:, :, 0]), S, integral(np.cross(felt, S, axis=1))
+    P = integral(np.cross(felt, S, axis=1))
+    return C, F, S, P
 
 
 STRETCH_S = 30.0
@@ -251,7 +257,8 @@ def stretches_of(seconds: Floats, parts: Ints) -> Iterator[slice]:
     if not len(intervals):
         return
     usual = float(np.median(intervals))
-    ends = np.flatnonzero((intervals > LARGEST_INTERVAL * usual) | (np.diff(parts) > 0)) + 1
+    is_end = (intervals > LARGEST_INTERVAL * usual) | (np.diff(parts) > 0)
+    ends = np.flatnonzero(is_end) + 1
     rows = max(LEAST_ROWS, round(STRETCH_S / max(usual, 1e-9)))
     for first, last in zip([0, *ends], [*ends, len(seconds)], strict=True):
         count = max(1, round((last - first - 1) / rows))
@@ -281,7 +288,8 @@ def velocity_changes(
     for r in runs:
         since = seconds[r] - seconds[r].mean()
         slow = np.vander(since, 3)  # gravity and its turning
-        carried = F[r] + slow @ np.linalg.lstsq(slow, x[r], rcond=None)[0] + turning[r] @ lever  # C R v
+        line, *_ = np.linalg.lstsq(slow, x[r], rcond=None)
+        carried = F[r] + slow @ line + turning[r] @ lever  # C R v
         in_body = np.einsum("nji,nj->ni", C[r], carried)
         S_since = S[r] - S[r][0]
         P_since = P[r] - P[r][0]
@@ -291,12 +299,14 @@ def velocity_changes(
         columns = [-carried[:, :, None], C[r] @ cross_matrices(in_body), turning[r], -S_since, drifting]
         together = max(1, round(MEAN_OVER_S / float(np.median(np.diff(since)))))
         t = means_over(since, together)
-        level_R_g = np.asarray(Rotation.align_vectors([[0.0, 0.0, 1.0]], F_since[-1:])[0].as_matrix())
+        upright, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], F_since[-1:])
+        level_R_g = np.asarray(upright.as_matrix())
         y = np.diff(means_over(x[r], together), axis=0) @ level_R_g.T
         A = level_R_g @ np.diff(means_over(np.concatenate(columns, axis=2), together), axis=0)
         duration = np.diff(t)
         gravity = duration[:, None, None] * np.eye(3)
-        B = np.concatenate([gravity, (t[:-1] + 0.5 * duration)[:, None, None] * gravity], axis=2)  # (m, 3, 6)
+        middle = t[:-1] + 0.5 * duration
+        B = np.concatenate([gravity, middle[:, None, None] * gravity], axis=2)  # (m, 3, 6)
         changes.append(SampleSeries(y, A, B, duration, walks=(True, True, False)))
     return changes
 

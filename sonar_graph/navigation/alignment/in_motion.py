@@ -87,7 +87,8 @@ class DopplerOnPath:
         turned = np.einsum("kij,kj->ki", C, at_imu)
         skewed = C @ cross_matrices(lever[None])
         rate_variance = known.imu.gyro_noise_density**2 / float(np.median(np.diff(path.seconds)))
-        R = C @ R @ C.transpose(0, 2, 1) + rate_variance * skewed @ skewed.transpose(0, 2, 1)
+        R = C @ R @ C.transpose(0, 2, 1)
+        R += rate_variance * skewed @ skewed.transpose(0, 2, 1)
         return cls(seconds, turned, turned - path.linear_at(seconds, path.impulse), skewed, R)
 
 
@@ -138,7 +139,8 @@ def align_in_motion(imu: Imu, dvl: Dvl, calibration: Calibration) -> InitialTilt
     """
     imu = until_hole(in_body_axes(imu, calibration))
     seconds, velocity, R = whole_doppler_rows(imu, dvl, calibration)
-    imu = imu.rows(imu.stamps_ns <= imu.stamps_ns[0] + round((LONGEST_S + 1.0) * 1e9))
+    last_ns = imu.stamps_ns[0] + round((LONGEST_S + 1.0) * 1e9)
+    imu = imu.rows(imu.stamps_ns <= last_ns)
     upward, _ = earth_up_and_level(calibration)
     path = InertialPath.of(imu)
     doppler = DopplerOnPath.of(path, seconds, velocity, R, calibration)
@@ -187,8 +189,10 @@ def whole_doppler_rows(imu: Imu, dvl: Dvl, calibration: Calibration) -> tuple[Fl
             f"alignment: {len(seconds)} Doppler samples beside the IMU; give {FEWEST} over {SHORTEST_S:g} s or more"
         )
     body_R_dvl = calibration.dvl.mounting.pose().rotation().matrix()
-    R = in_numbers(dvl.velocity_cov[inside], np.diag(np.square(calibration.dvl.velocity_sigma_m_s)))
-    return seconds, dvl.velocity[inside] @ body_R_dvl.T, body_R_dvl @ R @ body_R_dvl.T
+    default = np.diag(np.square(calibration.dvl.velocity_sigma_m_s))
+    R = in_numbers(dvl.velocity_cov[inside], default)
+    velocity = dvl.velocity[inside] @ body_R_dvl.T
+    return seconds, velocity, body_R_dvl @ R @ body_R_dvl.T
 
 
 def gauss_newton_step(
@@ -218,7 +222,8 @@ def gauss_newton_step(
     # whitened, and by parameters in units of their prior sigmas: a sigma of zero holds one at zero
     A = solve_triangular(root, H * sigma, lower=True)
     b = solve_triangular(root, residual.ravel(), lower=True)
-    prior = np.concatenate([np.zeros(5), state.gyro_bias, state.accel_bias, basis.T @ state.north])
+    north = basis.T @ state.north
+    prior = np.concatenate([np.zeros(5), state.gyro_bias, state.accel_bias, north])
     prior = np.divide(prior, sigma, out=np.zeros_like(prior), where=sigma > 0)
     information = cho_factor(A.T @ A + np.eye(len(sigma)))
     scaled = cho_solve(information, A.T @ b - prior)
@@ -232,8 +237,10 @@ def gauss_newton_step(
         basis @ (basis.T @ state.north + step[NORTH]),
     )
     covariance = sigma[:, None] * cho_solve(information, np.diag(sigma))
-    change = float(np.abs(step[TILT]).max() + np.abs(step[GYRO]).max() * doppler.seconds[-1])
-    return new, covariance, change, float(np.sum((b - A @ scaled) ** 2))
+    tilted = np.abs(step[TILT]).max()
+    turned_rad = np.abs(step[GYRO]).max() * doppler.seconds[-1]
+    chi_square = np.sum((b - A @ scaled) ** 2)
+    return new, covariance, float(tilted + turned_rad), float(chi_square)
 
 
 def _across(up: Floats) -> Floats:
@@ -249,11 +256,14 @@ def noise_covariance(path: InertialPath, doppler: DopplerOnPath, calibration: Ca
     before = t[:, None] >= t[None]  # the interval m ends at sample m
     dt = np.where(before, np.diff(edges)[None], 0.0)
     F = path.linear_at(0.5 * (edges[1:] + edges[:-1]), path.impulse)
-    arms = cross_matrices((doppler.x[:, None] + F[None]).reshape(-1, 3)).reshape(len(t), len(t), 3, 3)
-    by_turn = (sensors.gyro_noise_density * np.sqrt(dt)[:, :, None, None] * arms).transpose(0, 2, 1, 3)
-    by_turn = by_turn.reshape(3 * len(t), -1)
-    force = np.kron(sensors.accel_noise_density**2 * np.minimum(t[:, None], t[None]), np.eye(3))
+    k = len(t)
+    arms = cross_matrices((doppler.x[:, None] + F[None]).reshape(-1, 3))
+    noise = sensors.gyro_noise_density * np.sqrt(dt)[:, :, None, None]
+    by_turn = (noise * arms.reshape(k, k, 3, 3)).transpose(0, 2, 1, 3)
+    by_turn = by_turn.reshape(3 * k, -1)
+    shared_s = np.minimum(t[:, None], t[None])  # (k, k)
+    force = np.kron(sensors.accel_noise_density**2 * shared_s, np.eye(3))
     # R_k [j = k] in its blocks
-    own = np.zeros((len(t), 3, len(t), 3))
-    own[np.arange(len(t)), :, np.arange(len(t)), :] = doppler.R
+    own = np.zeros((k, 3, k, 3))
+    own[np.arange(k), :, np.arange(k), :] = doppler.R
     return np.asarray(by_turn @ by_turn.T + force + own.reshape(force.shape))

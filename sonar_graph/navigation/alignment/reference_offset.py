@@ -100,7 +100,9 @@ def match_reference_to_imu(imu: Imu, reference: Trajectory, calibration: Calibra
 
 def _stretches_of(parts: Ints) -> list[Ints]:
     """Rows of differences between poses of one part of the path; none of short parts."""
-    within = np.split(np.arange(len(parts) - 1), np.flatnonzero(np.diff(parts)) + 1)
+    changes = np.flatnonzero(np.diff(parts)) + 1
+    within = np.split(np.arange(len(parts) - 1), changes)
+    # the last difference before a hole goes over it
     within = [rows[:-1] if k + 1 < len(within) else rows for k, rows in enumerate(within)]
     return [
         stretch
@@ -124,7 +126,8 @@ def start_heading(path: InertialPath, reference: Trajectory, body_R_imu: Floats,
     C = Rotation.from_matrix(path.rotations_at(seconds[inside]))
     world_R_imu = reference.rotations()[np.flatnonzero(inside)] * Rotation.from_matrix(body_R_imu)
     turned = world_R_imu * C.inv()  # world_R_g: constant but for drift
-    heading = (turned * turned[len(turned) // 2].inv()).as_rotvec()[:, 2]
+    middle = turned[len(turned) // 2]
+    heading = (turned * middle.inv()).as_rotvec()[:, 2]
     t = seconds[inside]
     beginning = t <= t[0] + START_SHARE * run_s
     rest_t = t[~beginning]

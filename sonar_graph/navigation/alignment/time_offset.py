@@ -106,12 +106,14 @@ def rate_noise_power(stretches: Sequence[SampleSeries], ratios: Floats) -> float
         m = len(stretch.y)
         differences = np.diff(np.eye(m + 1), axis=0)
         factors = _factors(stretch, ratios)
-        own, _ = _orthonormal(np.concatenate([_whitened(factors[axis], stretch.B[:, axis]) for axis in range(3)]))
+        own_columns = [_whitened(factors[axis], stretch.B[:, axis]) for axis in range(3)]
+        own, _ = _orthonormal(np.concatenate(own_columns))
         power = 3.0 * m - own.shape[1]
         for axis in range(3):
             of_samples = _whitened(factors[axis], differences)
             basis = own[axis * m : (axis + 1) * m]
-            power -= float(np.sum(of_samples**2) - np.sum((basis.T @ of_samples) ** 2))
+            projected = basis.T @ of_samples
+            power -= float(np.sum(of_samples**2) - np.sum(projected**2))
         powers.append(power)
     return sum(powers)
 
@@ -123,6 +125,7 @@ def _factors(stretch: SampleSeries, ratios: Floats) -> list[Floats]:
     middle = np.cumsum(T) - 0.5 * T
     walk = np.outer(T, T) * np.minimum.outer(middle, middle)
     steady = np.diag(2.0 + ratios[0] * T) - np.eye(m, k=1) - np.eye(m, k=-1)
+    # axes of a kind have the same K: one factor each
     by_kind = {walks: np.linalg.cholesky(steady + walks * ratios[1] * walk) for walks in set(stretch.walks)}
     return [np.asarray(by_kind[walks], dtype=np.float64) for walks in stretch.walks]
 
@@ -155,7 +158,8 @@ class NormalEquations:
             own, size = _orthonormal(white[:, 1 + p :])
             kept = white[:, : 1 + p] - own @ (own.T @ white[:, : 1 + p])
             squares = kept.T @ kept  # of [y, A], (1 + p, 1 + p)
-            size = 2.0 * sum(float(np.log(np.diag(factor)).sum()) for factor in factors) + size
+            log_roots = [float(np.log(np.diag(factor)).sum()) for factor in factors]
+            size = 2.0 * sum(log_roots) + size
             parts.append((squares, 3 * m - own.shape[1], size))
         squares = [part[0] for part in parts]
         return cls(
@@ -181,7 +185,8 @@ class NormalEquations:
         """``-2 log L`` of the module's equation, but for a constant."""
         _, information, rss, _ = self.solve(prior_sigmas)
         freedom = max(self.freedom - len(prior_sigmas), 1)
-        return float(freedom * np.log(rss) + self.log_determinants + np.linalg.slogdet(information)[1])
+        _, log_information = np.linalg.slogdet(information)
+        return float(freedom * np.log(rss) + self.log_determinants + log_information)
 
 
 def _orthonormal(B: Floats) -> tuple[Floats, float]:
@@ -241,7 +246,8 @@ class OffsetFit:
 
     def offset(self) -> Estimate1D:
         """The offset as a number."""
-        return Estimate1D(self.offset_s, float(np.sqrt(self.fit.covariance[0, 0])), self.reason)
+        sigma_s = float(np.sqrt(self.fit.covariance[0, 0]))
+        return Estimate1D(self.offset_s, sigma_s, self.reason)
 
     def without_shared_noise(self, stretches: Sequence[SampleSeries], column: int) -> OffsetFit:
         """Corrected where one column of A holds the same rates' noise as y (`rate_noise_power`)."""
@@ -279,8 +285,9 @@ def reason_not_unique(grid: Floats, chi2: Floats, best: int) -> str:
     """The reason why the best offset of the grid does not stand out; empty: it does."""
     if best in (0, len(grid) - 1):
         return f"no best offset within ±{RANGE_S:g} s"
-    inner = np.flatnonzero((chi2[1:-1] <= chi2[:-2]) & (chi2[1:-1] <= chi2[2:])) + 1
-    others = [i for i in (*inner, 0, len(grid) - 1) if abs(grid[i] - grid[best]) > NEIGHBOURHOOD_S]
+    is_minimum = (chi2[1:-1] <= chi2[:-2]) & (chi2[1:-1] <= chi2[2:])
+    minima = (*(np.flatnonzero(is_minimum) + 1), 0, len(grid) - 1)
+    others = [i for i in minima if abs(grid[i] - grid[best]) > NEIGHBOURHOOD_S]
     rivals = [i for i in others if chi2[i] - chi2[best] < CLEARLY_WORSE]
     if rivals:
         return f"{grid[best]:+.1f} s and {grid[rivals[0]]:+.1f} s fit as well: too little changes in the motion"
@@ -310,6 +317,9 @@ def _with_offset(line_up: LineUp, offset_s: float, prior_sigmas: Floats, ratios:
     p = fit(here, prior_sigmas, ratios).parameters
     stretches = []
     for h, b, a in zip(here, before, after, strict=True):
-        slope = ((a.y - a.A @ p) - (b.y - b.A @ p)) / (2 * DERIVATIVE_STEP_S)
-        stretches.append(replace(h, A=np.concatenate([-slope[:, :, None], h.A], axis=2)))
+        residual_before = b.y - b.A @ p
+        residual_after = a.y - a.A @ p
+        slope = (residual_after - residual_before) / (2 * DERIVATIVE_STEP_S)  # (m, 3)
+        with_offset = np.concatenate([-slope[:, :, None], h.A], axis=2)
+        stretches.append(replace(h, A=with_offset))
     return stretches

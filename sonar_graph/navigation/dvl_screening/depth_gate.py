@@ -55,7 +55,8 @@ class DepthGate:
 
     def __init__(self, calibration: Calibration) -> None:
         start = calibration.start
-        z_m = float(start.pose().transformFrom(np.array(calibration.depth.port_m))[2])
+        world_p_port = start.pose().transformFrom(np.array(calibration.depth.port_m))
+        z_m = float(world_p_port[2])
         is_stated = "position_m" in start.model_fields_set
         length = LATEST_NS if is_stated else FEWEST - 1
         self._used = DepthChain(EARLIEST_NS, z_m, start.position_sigma_m[2] ** 2, length)
@@ -72,12 +73,14 @@ class DepthGate:
         else:
             self._used = self._used._replace(stamp_ns=stamp_ns - LONG_NS)
         self.newest_ns = stamp_ns
+        # t is bounded for a sample alone: after a minute the gate would let 180 m pass
         used = self._used
         sample = DepthChain(stamp_ns, z_m, variance_m2, 1)
         distance = used.distance(sample, longest_ns)
         if distance <= DEPTH_GATE:
             self._use(sample._replace(length=used.length + 1))
             return None
+        # refused as it is; it may continue a chain of refused samples
         near = [chain for chain in self._refused if chain.distance(sample) <= DEPTH_GATE]
         if near:
             before = max(near, key=lambda chain: chain.length)

@@ -124,7 +124,10 @@ def squared_distance(u: Vec3, Q_u: Mat3, v: Vec3, Q_v: Mat3, t: float, walk: flo
     d = xx * zz - xz * xz
     e = xy * xz - xx * yz
     f = xx * yy - xy * xy
-    return (a * x * x + d * y * y + f * z * z + 2.0 * (b * x * y + c * x * z + e * y * z)) / (xx * a + xy * b + xz * c)
+    determinant = xx * a + xy * b + xz * c
+    squares = a * x * x + d * y * y + f * z * z
+    products = b * x * y + c * x * z + e * y * z
+    return (squares + 2.0 * products) / determinant
 
 
 LONG_NS = 3_000_000_000
@@ -195,6 +198,7 @@ class VelocityConfirmation:
         beyond = self._waiting[:-MOST_WAITING]
         refused = [RefusedRow("dvl", old.stamp_ns, Refusal.UNCONFIRMED, np.nan) for old in beyond]
         self._waiting = self._waiting[-MOST_WAITING:]
+        # a clock that was set meanwhile: rows before the step confirm nothing after it
         newest_ns = self._waiting[-1].stamp_ns
         apart = [old.stamp_ns for old in self._waiting if newest_ns - old.stamp_ns > PAUSE_NS]
         refused += [RefusedRow("dvl", old_ns, Refusal.CLOCK, np.nan) for old_ns in apart]
@@ -210,6 +214,7 @@ class VelocityConfirmation:
         intervals = np.diff(self._recent_ns)
         long_ns = LONG_NS
         if len(intervals):
+            # the gate of a slow log is wide anyway
             long_ns = max(LONG_NS, LONG_INTERVALS * int(intervals.min()))
         since_ns = row.stamp_ns - self._recent_ns[-1]
         return since_ns > 0 and (is_waiting or (since_ns > long_ns and not row.is_partial))
@@ -232,6 +237,7 @@ class VelocityConfirmation:
 
     def release(self, chain: list[VelocityRow], refused: list[RefusedRow]) -> list[VelocityRow]:
         """Stop waiting up to the end of an accepted chain; rows outside it are refused, of a gap all but the last."""
+        # at the start all rows of the chain become epochs, after a gap its last one ends the gap
         stamps = {row.stamp_ns for row in chain}
         end_ns = chain[-1].stamp_ns
         is_start = not self._recent_ns
@@ -261,6 +267,7 @@ class VelocityConfirmation:
 
     def _distance(self, one: VelocityRow, other: VelocityRow) -> float:
         """Squared distance; the slower of the two decides how much turning can change."""
+        # S depends on the speed of the earlier row: the smaller of both gives the narrower gate
         fast, slow = sorted((one, other), key=lambda row: -float(row.velocity @ row.velocity))
         since_ns = abs(other.stamp_ns - one.stamp_ns)
         known = VelocityRows.of([slow._replace(stamp_ns=0)])

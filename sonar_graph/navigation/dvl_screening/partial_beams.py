@@ -93,7 +93,8 @@ def carry(imu: InertialRows, stamps_ns: Ints, calibration: Calibration) -> Carry
     felt = imu.around(int(stamps_ns[0]), int(stamps_ns[-1]))
     if felt is None:
         still = np.tile(np.eye(3), (n, 1, 1))
-        return Carry(still, np.zeros((n, 3)), np.zeros((n, 3)), calibration.dvl.velocity_walk_density, False)
+        nothing = np.zeros((n, 3))
+        return Carry(still, nothing, nothing, calibration.dvl.velocity_walk_density, False)
     times_ns = np.union1d(stamps_ns, felt.stamps_ns[felt.stamps_ns > stamps_ns[0]])
     middles_ns = times_ns[:-1] + np.diff(times_ns) // 2
     dt = (np.diff(times_ns) * 1e-9)[:, None]
@@ -102,7 +103,8 @@ def carry(imu: InertialRows, stamps_ns: Ints, calibration: Calibration) -> Carry
     rotation = running_rotations(turns)
     in_middle = rotation[:-1] @ Rotation.from_rotvec(0.5 * turns).as_matrix()
     velocity = np.zeros((len(times_ns), 3))
-    velocity[1:] = np.cumsum((in_middle @ gains[:, :, None])[:, :, 0], axis=0)
+    gained = in_middle @ gains[:, :, None]  # (steps, 3, 1)
+    velocity[1:] = np.cumsum(gained[:, :, 0], axis=0)
     at = np.searchsorted(times_ns, stamps_ns)
     lever = np.subtract(calibration.imu.mounting.translation_m, calibration.dvl.mounting.translation_m)
     from_lever = np.cross(felt.at(felt.rate, stamps_ns), lever)
@@ -149,7 +151,8 @@ class PartialVelocities:
 
     def remember(self, rows: VelocityRows) -> None:
         """Remember rows that are all whole, while none waits: `completed` would return them as they are."""
-        self._remember(VelocityRow(int(rows.stamps_ns[-1]), rows.velocity[-1], rows.cov[-1]))
+        stamp_ns = int(rows.stamps_ns[-1])
+        self._remember(VelocityRow(stamp_ns, rows.velocity[-1], rows.cov[-1]))
 
     def completed(self, rows: VelocityRows, is_partial: NDArray[np.bool_], imu: InertialRows) -> VelocityRows:
         """The rows that can be used now, all with a whole velocity; they may be older than those given.
@@ -175,6 +178,7 @@ class PartialVelocities:
         whole = self._whole
         shared = self._shared
         self._remember(row)
+        # rows before the first whole one cannot be completed
         if not within or whole is None:
             return []
         if row.stamp_ns - whole.stamp_ns > LONGEST_STRETCH_NS:
@@ -208,7 +212,8 @@ def solve_stretch(
     for k in range(1, len(rows) - 1):
         P_k = P[3 * k : 3 * k + 3].reshape(3, -1, 3)  # with all rows, (3, n, 3)
         once = np.einsum("ajb,j->ab", P_k[:, 1:-1], w[1:-1])
-        total = once + 2.0 * (P_k[:, 0] @ w_0 + w[-1] * P_k[:, -1])
+        with_ends = P_k[:, 0] @ w_0 + w[-1] * P_k[:, -1]
+        total = once + 2.0 * with_ends
         cov_k = 0.5 * (total + total.T) / w[k]  # (2) and (3), axes of frame 0
         R = by.rotation[k]
         velocity = R.T @ (y[k] + by.velocity[k]) - by.from_lever[k]
@@ -218,7 +223,8 @@ def solve_stretch(
         completed.append(VelocityRow(rows[k].stamp_ns, velocity, cov))
     R = by.rotation[-1]
     P_m = P[-3:].reshape(3, -1, 3)
-    return completed, R.T @ np.einsum("akb,k->ab", P_m[:, 1:-1], w[1:-1]) @ R
+    shared_next = np.einsum("akb,k->ab", P_m[:, 1:-1], w[1:-1])  # axes of frame 0
+    return completed, R.T @ shared_next @ R
 
 
 def least_squares(rows: list[VelocityRow], by: Carry, intervals_s: Floats) -> tuple[Floats, Floats]:
@@ -232,7 +238,9 @@ def least_squares(rows: list[VelocityRow], by: Carry, intervals_s: Floats) -> tu
         at = slice(3 * k, 3 * k + 3)
         measured = np.linalg.inv(R @ row.cov @ R.T)
         information[at, at] += measured
-        vector[at] += measured @ (R @ (row.velocity + by.from_lever[k]) - by.velocity[k])
+        y_measured = R @ (row.velocity + by.from_lever[k]) - by.velocity[k]
+        vector[at] += measured @ y_measured
+    # y_k+1 - y_k - g T_k is a walk
     for k, interval_s in enumerate(intervals_s.tolist()):
         step = np.zeros((3, size))
         step[:, 3 * k : 3 * k + 3] = -np.eye(3)

@@ -136,6 +136,7 @@ class RowIntake:
         if rows is None:
             return False
         confirmation = self._confirmation
+        # the whole block first: only where a row may have to wait they go one by one
         result = self._gated(rows)
         if confirmation is None:
             return self._place(rows, result)
@@ -180,12 +181,14 @@ class RowIntake:
 
     def _judged(self, given: Floats) -> tuple[NDArray[np.bool_], Floats]:
         """Which covariances are positive definite, or unknown, shape (n,), and all of them in numbers, (n, 3, 3)."""
+        n = len(given)
         if np.isnan(given).all():
-            return np.ones(len(given), np.bool_), np.tile(self._default_cov, (len(given), 1, 1))
+            return np.ones(n, np.bool_), np.tile(self._default_cov, (n, 1, 1))
         cov = in_numbers(given, self._default_cov)
         variances = np.linalg.eigvalsh(cov)
         asymmetry = np.abs(cov - cov.transpose(0, 2, 1))
-        is_symmetric = (asymmetry <= 1e-6 * variances[:, 2, None, None]).all(axis=(1, 2))
+        largest = variances[:, 2]
+        is_symmetric = (asymmetry <= 1e-6 * largest[:, None, None]).all(axis=(1, 2))
         is_sound = is_symmetric & (variances[:, 0] > ROUNDING * variances[:, 2])
         return is_sound | np.isnan(given[:, 0, 0]), cov
 
@@ -205,10 +208,12 @@ class RowIntake:
             self._partial.remember(rows)
         else:
             outlier = result.is_outlier
-            distances = zip(rows.stamps_ns[outlier].tolist(), result.distance[outlier].tolist(), strict=True)
-            for stamp_ns, distance in distances:
+            outlier_ns = rows.stamps_ns[outlier].tolist()
+            distances = result.distance[outlier].tolist()
+            for stamp_ns, distance in zip(outlier_ns, distances, strict=True):
                 self._refused.append(RefusedRow("dvl", stamp_ns, Refusal.OUTLIER, distance))
             inertial = InertialRows(self.imu.stamps_ns, *self.imu.values)
+            # a completed row is known from the whole row on that completed it
             whole_ns = rows.stamps_ns[result.is_accepted]
             rows = self._partial.completed(rows.where(~outlier), result.is_partial[~outlier], inertial)
             known_ns = whole_ns[whole_ns.searchsorted(rows.stamps_ns)]
