@@ -74,7 +74,7 @@ def closed_bridge(rows: Rows, sensors: Sensors, removed: Removed, start_ns: int,
     k = int(rows.dvl_ns.searchsorted(start_ns))
     T = (end_ns - start_ns) * 1e-9
     # Each end also ends or begins a neighbouring interval, of length d, and errors add up:
-    # ((T + d) / 2)^2 = (T / 2)^2 (1 + 2 d / T) + (d / 2)^2, of which the last is the neighbour's own. The interval
+    # ((T + d) / 2)^2 = (T / 2)^2 (1 + 2 d / T) + (d / 2)^2, the last term is the neighbour's own. The interval
     # after the gap is not known yet and taken as long as the one before. Of two successive gaps the later one
     # counts what they share.
     before_s = (rows.dvl_ns[k] - rows.dvl_ns[k - 1]) * 1e-9 if k > 0 else 0.0
@@ -93,7 +93,7 @@ def open_bridge(
 ) -> PreintegratedMotion:
     """Motion from an epoch to an instant in the gap after it, by rows that are known at that instant.
 
-    ``whole_end_ns``: end of the motion of which this is the first part, which decides whether it is a walk.
+    ``whole_end_ns``: end of the whole motion that this is a part of; its length decides whether the velocity walks.
     """
     k = int(rows.dvl_ns.searchsorted(start_ns))
     rows = rows.known(max(end_ns, int(rows.known_ns[k])))  # the epoch may be known later than the instant

@@ -57,7 +57,7 @@ UNTURNED = Turns(False, np.ones(3), np.ones(3), 0.0)
 
 @compiled
 def typical_ns(stamps: Ints, row: int) -> int:
-    """Median of the `ROWS_BEFORE` intervals before a row, of an even number the shorter; 0 where there is none."""
+    """Median of the `ROWS_BEFORE` intervals before a row, of an even number the shorter; 0 without intervals."""
     first = max(row - ROWS_BEFORE, 0)
     for k in range(first, row):
         interval = stamps[k + 1] - stamps[k]
@@ -74,7 +74,7 @@ def typical_ns(stamps: Ints, row: int) -> int:
 
 @compiled
 def hole_ns(stamps: Ints, rows: int, row: int, until_ns: int) -> int:
-    """Length of the hole before a row; 0 where there is none.
+    """Length of the hole before a row; 0 without a hole.
 
     Only the first ``rows`` stamps are known; ``row = rows`` means a hole that is open, and lasts until ``until_ns`` so
     far.
@@ -91,7 +91,7 @@ def hole_ns(stamps: Ints, rows: int, row: int, until_ns: int) -> int:
 
 
 def row_after_hole(stamps: Ints, first: int, last: int, longest_ns: int) -> int:
-    """The row after the first hole between two rows that lasts longer; -1 where there is none."""
+    """The row after the first hole between two rows that lasts longer; -1 without one."""
     intervals = np.diff(stamps[first : last + 1])
     for row in (first + 1 + np.flatnonzero(intervals > longest_ns)).tolist():
         if hole_ns(stamps, len(stamps), row, stamps[row]) > 0:

@@ -6,7 +6,7 @@ too few beams) from that of the row that confirms or completes it (`sonar_graph.
 counts as reached at time t when its row is known and an IMU row at or after it is stamped at or before t. What happens
 between epochs (a detection, a depth sample, an estimate) is related to the newest reached epoch by a provisional motion
 that uses nothing known later. Results therefore depend on stamps alone, to the bit, not on how a log is cut into calls
-or what was asked in between, as long as no row comes after another of its sensor that is stamped later.
+or on earlier calls, as long as no row comes after another of its sensor that is stamped later.
 
 Gaps. A gap between two epochs is bridged with both its ends known. In a gap that lasts, both instants are reached from
 the epoch at which bottom lock was lost::
@@ -258,7 +258,7 @@ class Odometry:
         return int(self._dvl.stamps_ns[last - 1]) if last > 0 else None
 
     def _require_interval(self, start_ns: int, end_ns: int) -> None:
-        """Raise MeasurementError where rows do not begin before an interval, or it is none."""
+        """Raise MeasurementError where rows do not begin before an interval, or its end lies before its start."""
         imu_ns = self._imu.stamps_ns
         dvl_ns = self._dvl.stamps_ns
         if not (len(imu_ns) and len(dvl_ns)):

@@ -98,14 +98,14 @@ class StampedRows:
         self._show(len(self.stamps_ns) - first, *(column[first:] for column in self._columns))
 
     def _show(self, n: int, *columns: NDArray[Any]) -> None:
-        """Set the columns, of which the first n rows are filled."""
+        """Set the columns, whose first n rows are filled."""
         self._columns = list(columns)
         self.stamps_ns = columns[0][:n]
         self.values = tuple([column[:n] for column in columns[1:]])
 
 
 def _with_room(old: NDArray[Any], n: int, size: int) -> NDArray[Any]:
-    """An array of more rows, of which the first n are those of an old one."""
+    """An array of more rows that begins with the first n rows of an old one."""
     column = np.empty((size, *old.shape[1:]), old.dtype)
     column[:n] = old[:n]
     return column

@@ -4,7 +4,7 @@ The frame g is the IMU's own at its first sample. With C = g_R_imu, piecewise li
 
     C <- C Exp((w_i + w_{i+1}) / 2 dt),    F(t) = int C f dt,    S(t) = int C dt,    P(t) = int [C f]x S dt
 
-Between two Doppler samples k, at their stamps plus the offset, velocity changes as the accelerometers say::
+Between two Doppler samples k, at their stamps plus the offset, velocity changes as the accelerometers measured::
 
     x_k = C_k (R v_k - w_k x l) - F_k
     x_{k+1} - x_k = -d(C R v) (s - 1) + d(C [R v]x) psi + d(C [w]x) dl - d(S) b + d(P - [C R v]x S) b_g
@@ -138,7 +138,7 @@ LARGEST_INTERVAL = 3.0
 """In usual intervals: a longer time between two samples ends a stretch."""
 LEAST_STRETCHES = 2
 PRIOR_SIGMAS = np.array([1.0, 0.05, 0.05, 1.0, *[3.0] * 3, *[0.5] * 3, *[0.02] * 3])
-"""Scale; turn, rad, about x and y near what the calibration says; lever arm, m; biases, m/s² and rad/s."""
+"""Scale; turn, rad, about x and y near the calibration's; lever arm, m; biases, m/s² and rad/s."""
 # places among the parameters, after the offset
 SCALE = 1
 YAW = 4

@@ -47,7 +47,7 @@ SHORTEST_S = 2.0
 LONGEST_S = 60.0
 """Longest time that is used."""
 FREE = 10.0
-"""Prior sigma of velocity (m/s) and tilt (rad), of which nothing is known."""
+"""Prior sigma of velocity (m/s) and tilt (rad), so wide that it does not matter."""
 OBSERVED = 0.5
 """A bias is observed where its sigma fell below this share of the prior's."""
 ROUNDS = 10

@@ -27,14 +27,14 @@ UNSTATED_M = 0.1
 DEPTH_GATE = 37.3
 """Chi-square quantile of 1 - 1e-9, 1 degree of freedom."""
 FEWEST = 3
-"""Least number of samples of a chain: of samples of which one in 20 is wrong, and alike, 3 in succession are wrong once
-in 8000 times."""
+"""Least number of samples of a chain: where one sample in 20 is wrong, all by the same value, 3 in succession are wrong
+once in 8000 times."""
 MOST_CHAINS = 10
 """Number of refused chains that are remembered."""
 
 
 class DepthChain(NamedTuple):
-    """Depth samples of which each can be reached from the one before: the last one, and their number."""
+    """Depth samples that can each be reached from the one before: the last one, and their number."""
 
     stamp_ns: int
     z_m: float

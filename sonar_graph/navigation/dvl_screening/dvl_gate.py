@@ -220,7 +220,7 @@ class VelocityConfirmation:
         return since_ns > 0 and (is_waiting or (since_ns > long_ns and not row.is_partial))
 
     def first_accepted_chain(self) -> list[VelocityRow]:
-        """The first chain of waiting rows that is long enough and a majority of its stretch; empty if there is none."""
+        """The first chain of waiting rows that is long enough and a majority of its stretch; empty without one."""
         whole = [row for row in self._waiting if not row.is_partial]
         chains: list[list[VelocityRow]] = []
         for row in whole:
