@@ -27,6 +27,7 @@ import numpy as np
 from baselines.event_order import Motion
 from baselines.sonar_update import GATED, Gate, SonarModel, admit, correction, far_view, polar_covariance
 from sonar_graph.measurements import Floats
+from sonar_graph.models import FLOOR_GATE, doubted, sonar_point, sonar_point_jacobian, wrap_angle, yaw_and_derivative
 from sonar_graph.numerics import (
     I3,
     LOWER_LEFT,
@@ -50,14 +51,6 @@ from sonar_graph.numerics import (
     store,
     store6,
     vec,
-)
-from sonar_graph.slam.models import (
-    FLOOR_GATE,
-    doubted,
-    sonar_point,
-    sonar_point_jacobian,
-    wrap_angle,
-    yaw_and_derivative,
 )
 
 POSE, COMPASS, MAP, LANDMARK = 6, 6, 7, 3

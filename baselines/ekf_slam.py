@@ -38,9 +38,9 @@ from baselines.filter import FilterParams, FilterShell
 from baselines.sonar_update import Gate
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
 from sonar_graph.measurements import Floats
+from sonar_graph.models import ACCEPTED
 from sonar_graph.motion import MotionSource
 from sonar_graph.numerics import compiled, rotation_from_euler, vec
-from sonar_graph.slam.landmarks import ACCEPTED
 
 
 @compiled

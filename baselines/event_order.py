@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonar_graph.measurements import Floats, Ints
+from sonar_graph.models import ACCEPTED
 from sonar_graph.motion import Motions
 from sonar_graph.navigation.alignment import up_direction
 from sonar_graph.numerics import I3, LOWER_LEFT, ZERO, compiled, cross, exp_and_mean, mat, store, vec
-from sonar_graph.slam.landmarks import ACCEPTED
 
 
 class Motion(Motions):

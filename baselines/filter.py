@@ -49,11 +49,10 @@ from sonar_graph.measurements import (
     PositionFixes,
     require_measurements,
 )
+from sonar_graph.models import MINIMUM_PROBABILITY, Contradictions, identify, wrap_angle, yaw_and_derivative
 from sonar_graph.motion import MotionSource, require_source
 from sonar_graph.navigation.alignment import earth_rate_in_world, tilt_sigma
 from sonar_graph.numerics import cross_matrix
-from sonar_graph.slam.landmarks import MINIMUM_PROBABILITY, identify
-from sonar_graph.slam.models import Contradictions, wrap_angle, yaw_and_derivative
 from sonar_graph.states import (
     OUTCOME_NUMBERS,
     CausalEstimates,

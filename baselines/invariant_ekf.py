@@ -15,9 +15,8 @@ from baselines.invariant_equations import BARE, BETA, BODY, EYE, THETA, UP, Inva
 from baselines.sonar_update import GATED, admit, far_view, polar_covariance
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
 from sonar_graph.measurements import Floats
+from sonar_graph.models import BIASES, FLOOR_GATE, bias_sigmas, doubted, gyro_bias_of, wrap_angle
 from sonar_graph.motion import MotionSource
-from sonar_graph.slam import BIASES, bias_sigmas, gyro_bias_of
-from sonar_graph.slam.models import FLOOR_GATE, doubted, wrap_angle
 
 
 class InvariantEkfParams(FilterParams):

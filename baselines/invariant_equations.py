@@ -1,7 +1,7 @@
 """Equations of the right-invariant EKF: state and error, prediction, measurement models, update, augmentation.
 
 The state is a rotation and 1 + N points that turn with the world, one element of SE_{1+N}(3), and the biases b of
-`sonar_graph.slam.biases`. The error is right-invariant::
+`sonar_graph.models.biases`. The error is right-invariant::
 
     R = Exp(theta) R^,    x_k = Exp(theta) x_k^ + J_l(theta) xi_k,    b = b^ + beta                            (1)
 
@@ -50,9 +50,18 @@ import numpy as np
 from baselines.event_order import Motion
 from baselines.sonar_update import SonarModel, correction
 from sonar_graph.measurements import Floats
+from sonar_graph.models import (
+    ACCEL,
+    BIASES,
+    COMPASS,
+    SCALE,
+    by_biases,
+    project,
+    sonar_point,
+    sonar_point_jacobian,
+    yaw_and_derivative,
+)
 from sonar_graph.numerics import compiled, exp_and_mean, store, vec
-from sonar_graph.slam import ACCEL, BIASES, COMPASS, SCALE, by_biases
-from sonar_graph.slam.models import project, sonar_point, sonar_point_jacobian, yaw_and_derivative
 
 THETA, BETA, BODY = slice(0, 3), slice(3, 3 + BIASES), slice(3 + BIASES, 6 + BIASES)
 """Places of theta, beta and xi_0 in xi."""
@@ -72,7 +81,7 @@ class InvariantState:
     points: Floats
     """Positions of the body and of the landmarks, shape (1 + N, 3), m."""
     bias: Floats
-    """b of `sonar_graph.slam.biases`, shape (11,)."""
+    """b of `sonar_graph.models.biases`, shape (11,)."""
     P: Floats
     """Covariance of xi, shape (17 + 3 N, 17 + 3 N)."""
     body_p_dvl: Floats = field(default_factory=lambda: np.zeros(3))

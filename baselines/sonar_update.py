@@ -11,9 +11,8 @@ import numpy as np
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Floats, Ints
+from sonar_graph.models import elevation_on_floor, gate_threshold
 from sonar_graph.numerics import compiled
-from sonar_graph.slam.landmarks import gate_threshold
-from sonar_graph.slam.models import elevation_on_floor
 from sonar_graph.states import OUTCOME_NUMBERS, Outcome
 
 USED, GATED, NEW, LET_IN = (OUTCOME_NUMBERS[o] for o in (Outcome.USED, Outcome.GATED, Outcome.NEW, Outcome.LET_IN))

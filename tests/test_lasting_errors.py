@@ -12,10 +12,10 @@ from baselines.ekf_slam import EkfSlam
 from baselines.invariant_ekf import InvariantEkf
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting, Start
 from sonar_graph.measurements import Depth, Dvl, Heading, Imu, PositionFixes
+from sonar_graph.models import BIASES, COMPASS, HEADING, SCALE, TILT, by_biases, gyro_bias_of
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.slam import Isam2
-from sonar_graph.slam.biases import BIASES, COMPASS, HEADING, SCALE, TILT, by_biases, gyro_bias_of
 
 G, ARM = 9.80665, (-0.3, 0.2, 0.1)
 END_NS = 60_000_000_000

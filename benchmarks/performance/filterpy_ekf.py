@@ -17,12 +17,19 @@ from filterpy.kalman import ExtendedKalmanFilter
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import NS_PER_S, Floats, Ints
+from sonar_graph.models import (
+    ACCEPTED,
+    FLOOR_GATE,
+    MINIMUM_PROBABILITY,
+    elevation_on_floor,
+    identify,
+    locate_jacobians,
+    range_azimuth_jacobians,
+)
 from sonar_graph.motion import PreintegratedMotion
 from sonar_graph.navigation import Odometry
 from sonar_graph.navigation.alignment import gravity_direction
 from sonar_graph.sequence import Sequence
-from sonar_graph.slam.landmarks import ACCEPTED, MINIMUM_PROBABILITY, identify
-from sonar_graph.slam.models import FLOOR_GATE, elevation_on_floor, locate_jacobians, range_azimuth_jacobians
 
 GRAVITY_INTERVAL_NS = NS_PER_S
 NO_BIAS = np.zeros(3)

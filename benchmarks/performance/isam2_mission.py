@@ -28,12 +28,13 @@ from common import conclude, make_parser, note, print_table
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import LandmarkDetections, Measurements
+from sonar_graph.models import BIASES, bias_sigmas, by_biases, elevation_on_floor, locate
 from sonar_graph.navigation import Odometry, PreintegratedMotion
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
-from sonar_graph.slam.biases import BIASES, bias_sigmas, by_biases
+from sonar_graph.slam import factors
 from sonar_graph.slam.isam2 import Isam2
-from sonar_graph.slam.models import OdometryWithBias, elevation_on_floor, factors, locate
+from sonar_graph.slam.odometry_factor import OdometryWithBias
 from sonar_graph.states import Estimate
 
 FRAME_RATE_HZ = 2.0

@@ -43,7 +43,7 @@ from sonar_graph import Calibration, Odometry
 from sonar_graph.calibration import ImuCalibration
 from sonar_graph.measurements import Dvl, Floats, Imu
 from sonar_graph.motion import PreintegratedMotion
-from sonar_graph.slam.models import OdometryWithBias
+from sonar_graph.slam.odometry_factor import OdometryWithBias
 
 NS = 1_000_000_000
 IMU_HZ, DVL_HZ = 200, 5

@@ -27,12 +27,11 @@ from scipy.spatial.transform import Rotation
 from sonar_graph import Calibration, Odometry
 from sonar_graph.calibration import Section
 from sonar_graph.measurements import Depth, Floats, LandmarkDetections, Measurements
+from sonar_graph.models import ACCEPTED, MINIMUM_PROBABILITY, elevation_on_floor, identify, locate
 from sonar_graph.motion import MotionSource, PreintegratedMotion
 from sonar_graph.navigation.preintegration import Rows, Sensors
 from sonar_graph.numerics import running_rotations
-from sonar_graph.slam import Isam2
-from sonar_graph.slam.landmarks.association import ACCEPTED, MINIMUM_PROBABILITY, identify
-from sonar_graph.slam.models import elevation_on_floor, factors, locate
+from sonar_graph.slam import Isam2, factors
 from sonar_graph.states import (
     OUTCOME_NUMBERS,
     CausalEstimates,

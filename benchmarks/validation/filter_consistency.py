@@ -39,8 +39,9 @@ from consistency import SETTLING_S, judge
 
 from baselines import invariant_equations
 from sonar_graph.evaluation import ErrorSeries, RunResult, compare, landmark_errors, normalised_squares, rmse
+from sonar_graph.models import by_biases
 from sonar_graph.simulation import BasinOptions, simulate_basin
-from sonar_graph.slam import by_biases, keyframes
+from sonar_graph.slam import keyframes
 from sonar_graph.states import LandmarkMap, Outcome
 
 ESTIMATORS = {

@@ -33,10 +33,10 @@ from recognition import ACCEPTED, LITERAL, OURS, digest, normalised, normalised_
 from recognition_runs import NONE, UNJUDGED, Detections, Run, kept_run
 
 from sonar_graph.evaluation.consistency import reliability
+from sonar_graph.models import MINIMUM_PROBABILITY
 from sonar_graph.simulation import BasinOptions
 from sonar_graph.simulation.sonar_image import ImageOptions
 from sonar_graph.simulation.sonar_image.strangers import GROUPS
-from sonar_graph.slam.landmarks.association import MINIMUM_PROBABILITY
 from sonar_graph.sonar import SHIPPED, read_confusion
 
 STRANGERS = {"strangers": ["natural", "look-alikes"]}

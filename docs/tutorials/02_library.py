@@ -12,8 +12,7 @@ from gtsam.symbol_shorthand import L, X
 from sonar_graph.logs import read_log, write_log
 from sonar_graph.navigation import Odometry
 from sonar_graph.simulation import BasinOptions, simulate_basin
-from sonar_graph.slam import Isam2, Isam2Params, KeyframeParams
-from sonar_graph.slam.models import factors
+from sonar_graph.slam import Isam2, Isam2Params, KeyframeParams, factors
 
 # 1. A log: blocks of columns, stamps in integer nanoseconds. `help(sonar_graph)` states frames and units.
 log = Path("basin.mcap")

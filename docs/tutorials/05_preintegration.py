@@ -11,7 +11,7 @@ from gtsam.symbol_shorthand import B, X
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation import Odometry
-from sonar_graph.slam.models import OdometryWithBias
+from sonar_graph.slam.odometry_factor import OdometryWithBias
 
 NS = 1_000_000_000
 

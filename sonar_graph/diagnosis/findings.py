@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Start
 from sonar_graph.errors import AlignmentError
 from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Heading, Imu
+from sonar_graph.models import wrap_angle
 from sonar_graph.navigation.alignment import (
     LONGEST_S,
     DvlMatch,
@@ -291,7 +292,7 @@ def tilt_findings(found: StartTilt, start: Start, yaw_rad: float) -> list[Findin
     for axis, name in enumerate(("roll", "pitch")):
         told, of_calibration = found.angle(axis), f"the calibration's {np.degrees(given[axis]):+.2f}°"
         sigma = float(np.hypot(told.sigma, start.rpy_sigma_rad[axis]))
-        acts = matters(replace(told, value=_wrapped(told.value - given[axis]), sigma=sigma), LEAST_TILT_RAD)
+        acts = matters(replace(told, value=wrap_angle(told.value - given[axis]), sigma=sigma), LEAST_TILT_RAD)
         advice = (
             f"{found.said}, not {of_calibration}: {line}" if acts else f"{found.said}; {of_calibration} fits, {NO_NEED}"
         )
@@ -334,7 +335,7 @@ def find_start_heading(sequence: Sequence, reference: Trajectory, offset: Estima
     pose = reference.at(np.array([at_ns]))
     yaw, pitch, roll = pose.rotations().as_euler("ZYX")[0].tolist()
     x, y, z = pose.positions[0].tolist()
-    error = _wrapped(sequence.calibration.start.rpy_rad[2] - yaw)
+    error = wrap_angle(sequence.calibration.start.rpy_rad[2] - yaw)
     begin_ns, end_ns = max(at_ns - TURN_OVER_NS // 2, first_ns), min(at_ns + TURN_OVER_NS // 2, last_ns)
     turn_rate = 0.0
     if end_ns > begin_ns:
@@ -342,10 +343,6 @@ def find_start_heading(sequence: Sequence, reference: Trajectory, offset: Estima
         turn_rate = float((begin.inv() * end).magnitude()) * NS_PER_S / (end_ns - begin_ns)
     spread = float(np.hypot(LEAST_SPREAD_RAD, turn_rate * offset.sigma))
     return StartHeading((roll, pitch, yaw), (x, y, z), Estimate1D(error, spread))
-
-
-def _wrapped(angle_rad: float) -> float:
-    return float(np.angle(np.exp(1j * angle_rad)))
 
 
 def _beginning(sequence: Sequence, seconds: float) -> tuple[Imu | None, Dvl | None]:

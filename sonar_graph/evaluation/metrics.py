@@ -15,6 +15,7 @@ import numpy as np
 
 from sonar_graph.errors import EvaluationError
 from sonar_graph.measurements import NS_PER_S, Floats, Ints
+from sonar_graph.models import wrap_angle
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import FIRST_ANONYMOUS_ID, LandmarkMap, Trajectory
 
@@ -117,11 +118,6 @@ def rmse(errors: Floats) -> float:
     return float(np.sqrt(np.mean(np.square(errors)) * errors[0].size))
 
 
-def wrapped(angles_rad: Floats) -> Floats:
-    """Angles brought into [-pi, pi)."""
-    return np.asarray((angles_rad + np.pi) % (2 * np.pi) - np.pi)
-
-
 def yaw_rad(matrices: Floats) -> Floats:
     """Heading of the body's x axis, ``atan2(R[1, 0], R[0, 0])``, shape (n,).
 
@@ -163,7 +159,7 @@ def ate_se3_m(estimate: Trajectory, truth: Trajectory) -> float:
 def yaw_errors_rad(estimate: Trajectory, truth: Trajectory) -> Floats:
     """Estimated minus true heading, wrapped, shape (n,)."""
     check_paired(estimate, truth)
-    return wrapped(yaw_rad(estimate.matrices) - yaw_rad(truth.matrices))
+    return wrap_angle(yaw_rad(estimate.matrices) - yaw_rad(truth.matrices))
 
 
 def return_error_m(estimate: Trajectory, truth: Trajectory) -> float:
@@ -201,7 +197,7 @@ def relative_errors(estimate: Trajectory, truth: Trajectory, delta_s: float) -> 
 
     error_m = body_displacement(estimate) - body_displacement(truth)
     yaw_error = yaw_errors_rad(estimate, truth)
-    return RelativeErrors(np.linalg.norm(error_m, axis=1), wrapped(yaw_error[second] - yaw_error[first]))
+    return RelativeErrors(np.linalg.norm(error_m, axis=1), wrap_angle(yaw_error[second] - yaw_error[first]))
 
 
 def pairs_apart(stamps_ns: Ints, delta_s: float) -> tuple[Ints, Ints]:

@@ -13,6 +13,7 @@ from itertools import compress
 import numpy as np
 
 from sonar_graph.measurements import NO_TRACK, Floats, LandmarkDetections
+from sonar_graph.models import KernelParams
 from sonar_graph.slam.estimates import Solution
 from sonar_graph.slam.keyframes import Keyframes
 from sonar_graph.slam.landmarks import (
@@ -29,7 +30,6 @@ from sonar_graph.slam.landmarks import (
     SightingFactors,
     TrackedIdentities,
 )
-from sonar_graph.slam.models import KernelParams
 from sonar_graph.slam.smoother import Changed
 from sonar_graph.states import DetectionLog, Outcome
 

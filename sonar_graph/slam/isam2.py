@@ -21,12 +21,12 @@ from pydantic import model_validator
 from sonar_graph.calibration import Calibration, Section, require_params
 from sonar_graph.errors import CalibrationError, EstimatorError
 from sonar_graph.measurements import NS_PER_S, Floats, Ints, Measurements, PositionFixes, require_measurements
+from sonar_graph.models import KernelParams, RobustKernel
 from sonar_graph.motion import MotionSource, require_source
 from sonar_graph.slam.estimates import AnchoredPose, PoseHistory
 from sonar_graph.slam.frontend import Frontend
 from sonar_graph.slam.keyframes import KeyframeParams, Keyframes
 from sonar_graph.slam.landmarks import IdentityParams, MixtureIdentity, RobustIdentity
-from sonar_graph.slam.models import KernelParams, RobustKernel
 from sonar_graph.slam.smoother import (
     HistoryParams,
     JointCovariance,

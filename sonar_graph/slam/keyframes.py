@@ -21,11 +21,23 @@ from pydantic import Field
 
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.measurements import Depth, Dvl, Floats, Heading, Imu, Ints
+from sonar_graph.models import (
+    BIASES,
+    COMPASS,
+    HEADING,
+    HUBER_WIDTHS,
+    TILT,
+    Contradictions,
+    bias_sigmas,
+    by_biases,
+    gyro_bias_of,
+    wrap_angle,
+)
 from sonar_graph.motion import MotionSource, PreintegratedMotion
 from sonar_graph.navigation.alignment import gravity_direction
 from sonar_graph.numerics import cross_matrix
-from sonar_graph.slam.biases import BIASES, COMPASS, HEADING, TILT, bias_sigmas, by_biases, gyro_bias_of
-from sonar_graph.slam.models import HUBER_WIDTHS, Contradictions, OdometryWithBias, factors
+from sonar_graph.slam import factors
+from sonar_graph.slam.odometry_factor import OdometryWithBias
 from sonar_graph.slam.smoother import Changed, Smoother
 from sonar_graph.states import Refusal, RefusedRow
 
@@ -351,10 +363,10 @@ class Keyframes:
         yaw_rad = np.arctan2(R_k[:, 1, 0], R_k[:, 0, 0])
         ups = carried.k_R_j[1:] @ R_j[2]
         wander = np.einsum("ka,kab,kb->k", ups, carried.C[:, :3, :3], ups)
-        missed = wrapped(heading.yaw_rad[carried.first :] - yaw_rad[:-1] - compass_rad)
+        missed = wrap_angle(heading.yaw_rad[carried.first :] - yaw_rad[:-1] - compass_rad)
         sigma = heading.sigma_rad[carried.first :]
         sigma = np.where(np.isnan(sigma), self.calibration.heading.sigma_rad, sigma)
-        off = np.abs(wrapped(missed - np.median(missed))) / (HUBER_WIDTHS[1] * sigma)
+        off = np.abs(wrap_angle(missed - np.median(missed))) / (HUBER_WIDTHS[1] * sigma)
         weights, mean_variance = weights_at_end(sigma**2 * np.maximum(1.0, off), wander)
         measured = float(yaw_rad[-1] + compass_rad + weights @ missed)
         key = self.bias_keys[-1]
@@ -362,7 +374,7 @@ class Keyframes:
 
         def distances(values: gtsam.Values) -> Floats:
             x, y, _ = values.atPose3(X(j)).matrix()[:3, 0]
-            off = wrapped(missed + compass_rad + yaw_rad[-1] - np.arctan2(y, x))
+            off = wrap_angle(missed + compass_rad + yaw_rad[-1] - np.arctan2(y, x))
             return np.asarray(np.abs(off) / np.hypot(sigma, self.calibration.heading.bias_sigma_rad))
 
         self._unjudged.append(("heading", distances))
@@ -414,11 +426,6 @@ class Keyframes:
         walked = np.where(self._walks > 0, self._walks * np.sqrt(elapsed_s), factors.STEADY * self._bias_sigmas)
         self.smoother.add({"bias walk": factors.bias_walk(old, new, walked)})
         return new
-
-
-def wrapped(angles_rad: Floats) -> Floats:
-    """The same directions, within half a turn of zero."""
-    return np.arctan2(np.sin(angles_rad), np.cos(angles_rad))
 
 
 def weights_at_end(variance_m2: Floats, wander_m2: Floats) -> tuple[Floats, float]:

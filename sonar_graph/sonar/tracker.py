@@ -32,6 +32,7 @@ from scipy.special import ndtr
 from sonar_graph.calibration import Section
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Floats, Ints
+from sonar_graph.models import project_points, wrap_angle
 from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.sonar.geometry import point_covariances, points
 from sonar_graph.sonar.regions import Candidates
@@ -131,19 +132,14 @@ class Expected(NamedTuple):
     @classmethod
     def of(cls, tracks: TrackStates, noise: Floats) -> Expected:
         """Expectation under measurement noise of shape (2, 2)."""
-        q, (x, y, _) = tracks.position_m, tracks.position_m.T
-        h2 = x**2 + y**2
-        z, H = np.empty((len(q), 2)), np.zeros((len(q), 2, 3))
-        z[:, 0], z[:, 1] = np.sqrt(h2 + q[:, 2] ** 2), np.arctan2(y, x)
-        H[:, 0] = q / z[:, :1]
-        H[:, 1, 0], H[:, 1, 1] = -y / np.maximum(h2, 1e-12), x / np.maximum(h2, 1e-12)
+        z, H = project_points(np.ascontiguousarray(tracks.position_m))
         S = H @ tracks.position_cov @ H.mT + noise
         return cls(z, H, S, np.asarray(np.linalg.inv(S), np.float64))
 
     def innovations(self, z: Floats) -> Floats:
         """Measured minus expected, the azimuth wrapped: of one measurement a track, or of shape (n, 1, 2) of each."""
         e = z - self.z
-        e[..., 1] -= 2 * math.pi * np.rint(e[..., 1] / (2 * math.pi))
+        e[..., 1] = wrap_angle(e[..., 1])
         return e
 
     def densities(self, z: Floats, gate: float) -> Floats:

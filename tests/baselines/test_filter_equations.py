@@ -10,8 +10,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from baselines import ekf_equations, invariant_equations
 from baselines.sonar_update import USED, Gate, SonarModel, correction
 from sonar_graph.calibration import DepthCalibration, PlanarMotion, Start
+from sonar_graph.models import locate, range_azimuth
 from sonar_graph.navigation import Odometry
-from sonar_graph.slam.models.views import locate, range_azimuth
 from sonar_graph.testing import check_derivative
 from sonar_graph.testing.numerical import central_differences
 

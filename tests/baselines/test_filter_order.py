@@ -12,9 +12,9 @@ from baselines.sonar_update import USED
 from sonar_graph.calibration import Calibration, FloorPrior, SonarCalibration
 from sonar_graph.errors import EstimatorError, MeasurementError
 from sonar_graph.measurements import NS_PER_S, Measurements
+from sonar_graph.models import ACCEPTED
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
-from sonar_graph.slam.landmarks import ACCEPTED
 from sonar_graph.states import CausalEstimates, Estimate, Outcome, Refusal
 
 from .runs import (

@@ -22,13 +22,10 @@ from baselines.sonar_update import (
 )
 from sonar_graph.calibration import FloorPrior, SonarCalibration
 from sonar_graph.measurements import NS_PER_S
+from sonar_graph.models import FLOOR_GATE, RobustKernel, elevation_on_floor, gate_threshold, locate, range_azimuth
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
-from sonar_graph.slam.landmarks.association import gate_threshold
-from sonar_graph.slam.models import RobustKernel
-from sonar_graph.slam.models.sonar_model import FLOOR_GATE, elevation_on_floor
-from sonar_graph.slam.models.views import locate, range_azimuth
 from sonar_graph.testing.numerical import central_differences
 
 from .filters import (

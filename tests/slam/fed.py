@@ -6,7 +6,8 @@ import pytest
 from gtsam.symbol_shorthand import B, L, X
 
 from sonar_graph.measurements import Floats
-from sonar_graph.slam.models import OdometryWithBias, factors
+from sonar_graph.slam import factors
+from sonar_graph.slam.odometry_factor import OdometryWithBias
 from sonar_graph.slam.smoother import Factors
 
 from .graphs import block_of, dense_covariance

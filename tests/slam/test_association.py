@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy.stats import chi2, multivariate_normal
 
 from sonar_graph.measurements import NO_TRACK, Floats, LandmarkDetections
+from sonar_graph.models import ACCEPTED, identify
 from sonar_graph.slam.landmarks import AmendableJournal
-from sonar_graph.slam.landmarks.association import ACCEPTED, identify
 from sonar_graph.slam.landmarks.joint_compatibility import UNPAIRED, Innovations, Pairing, believed, pair_jointly
 from sonar_graph.slam.landmarks.mixture import LEAST_LANDMARKS, IdentityPosterior, RecogniserErrors
 from sonar_graph.slam.landmarks.tracked import NO_LANDMARK, UNDECIDED, decide, second_rows_of_tracks

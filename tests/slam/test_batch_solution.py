@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import L, X
 
-from sonar_graph.slam.models import factors
+from sonar_graph.slam import factors
 from sonar_graph.slam.smoother import Smoother, batch_solution
 from sonar_graph.slam.smoother.batch_solution import (
     Marginals,

@@ -10,7 +10,8 @@ from scipy.integrate import trapezoid
 from scipy.stats import multivariate_normal
 
 from sonar_graph.measurements import Floats
-from sonar_graph.slam import GaussianKernel, RobustKernel
+from sonar_graph.models import Kernel
+from sonar_graph.slam import GaussianKernel, RobustKernel, factors
 from sonar_graph.slam.landmarks import mixture
 from sonar_graph.slam.landmarks.mixture import (
     REPEATED_LOSS,
@@ -21,7 +22,6 @@ from sonar_graph.slam.landmarks.mixture import (
     TrackedObject,
 )
 from sonar_graph.slam.landmarks.sighting import Sighting
-from sonar_graph.slam.models import Kernel, factors
 from sonar_graph.slam.smoother.batch_solution import Sightline
 
 from .made import plain, polar, values_of

@@ -12,6 +12,7 @@ from scipy.stats import multivariate_normal
 from sonar_graph import run_estimator
 from sonar_graph.calibration import FloorPrior, SonarCalibration
 from sonar_graph.measurements import Floats
+from sonar_graph.models import Kernel
 from sonar_graph.slam import GaussianKernel, KeyframeParams, MixtureIdentity, RobustIdentity, RobustKernel
 from sonar_graph.slam.landmarks import mixture
 from sonar_graph.slam.landmarks import mixture_policy as doubtful_identities
@@ -19,7 +20,6 @@ from sonar_graph.slam.landmarks.landmark_graph import AmendableJournal, Assignme
 from sonar_graph.slam.landmarks.mixture import Choices, IdentityPosterior, Mixture, RecogniserErrors, TrackedObject
 from sonar_graph.slam.landmarks.mixture_policy import MixtureIdentities
 from sonar_graph.slam.landmarks.sighting import SeenFrame, Sighting, SightingFactors
-from sonar_graph.slam.models import Kernel
 from sonar_graph.slam.smoother.batch_solution import Sightline
 from sonar_graph.states import Outcome
 from sonar_graph.testing import misnamed_world

@@ -12,10 +12,18 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from sonar_graph.measurements import Floats
+from sonar_graph.models import (
+    elevation_on_floor,
+    locate,
+    locate_jacobians,
+    project,
+    range_azimuth,
+    range_azimuth_jacobians,
+    sonar_point,
+    wrap_angle,
+)
 from sonar_graph.navigation import PreintegratedMotion
-from sonar_graph.slam.models.prediction import PredictedView, Source, weigh
-from sonar_graph.slam.models.sonar_model import elevation_on_floor, project, sonar_point, wrap_angle
-from sonar_graph.slam.models.views import locate, locate_jacobians, range_azimuth, range_azimuth_jacobians
+from sonar_graph.slam.prediction import PredictedView, Source, weigh
 from sonar_graph.slam.smoother.batch_solution import JointCovariance
 from sonar_graph.testing import check_derivative
 from sonar_graph.testing.numerical import central_differences

@@ -15,9 +15,8 @@ from sonar_graph.measurements import Measurements
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
-from sonar_graph.slam import Isam2
+from sonar_graph.slam import Isam2, factors
 from sonar_graph.slam.landmarks.sighting import SightingFactors
-from sonar_graph.slam.models import factors
 from sonar_graph.slam.smoother.factor_store import FactorGroup, Factors
 from sonar_graph.slam.smoother.incremental import Smoother
 from sonar_graph.slam.smoother.observability import LEAST_SAID, left_open

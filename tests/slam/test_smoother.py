@@ -6,7 +6,7 @@ import pytest
 from gtsam.symbol_shorthand import B, L, X
 
 from sonar_graph.calibration import Calibration, Start
-from sonar_graph.slam.models import factors
+from sonar_graph.slam import factors
 from sonar_graph.slam.smoother import batch_solution
 from sonar_graph.slam.smoother.batch_solution import solve
 from sonar_graph.slam.smoother.factor_store import FactorGroup

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import L, X
 
-from sonar_graph.slam.models import factors
+from sonar_graph.slam import factors
 from sonar_graph.slam.smoother import FactorGroup, incremental, submap_window
 from sonar_graph.slam.smoother.batch_solution import picked
 from sonar_graph.slam.smoother.submap_window import Submap, bending

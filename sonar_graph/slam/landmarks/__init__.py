@@ -1,6 +1,5 @@
 """Identities of detections: what is believed, gated, taken back or chosen anew (docs/theory/doubtful_identities.md).
 
-association.py       the recogniser's posterior, accepted above a least probability
 sighting.py          a frame's detections tied to a keyframe, and their factors
 landmark_graph.py    the life of a detection, and its one writer: which sightings are of which landmark
 tracked.py           policies "robust" (default) and "gate": a wrong identity is taken back when its track is renamed
@@ -9,7 +8,6 @@ mixture_policy.py    policy "max-mixture", of the log densities and votes in mix
 """
 
 # fmt: off
-from sonar_graph.slam.landmarks.association import ACCEPTED, MINIMUM_PROBABILITY, gate_threshold, identify
 from sonar_graph.slam.landmarks.landmark_graph import AmendableJournal, IdentityPolicy, LandmarkGraph
 from sonar_graph.slam.landmarks.mixture_policy import IdentityParams, MixtureIdentities, MixtureIdentity
 from sonar_graph.slam.landmarks.sighting import Screened, SeenFrame, SightingFactors
@@ -17,7 +15,7 @@ from sonar_graph.slam.landmarks.tracked import GatedIdentity, RobustIdentity, Tr
 from sonar_graph.slam.landmarks.unknown import AssociatedUnknown, NamelessLandmarks
 
 __all__ = [
-    "ACCEPTED", "AmendableJournal", "AssociatedUnknown", "GatedIdentity", "IdentityParams", "IdentityPolicy",
-    "LandmarkGraph", "MINIMUM_PROBABILITY", "MixtureIdentities", "MixtureIdentity", "NamelessLandmarks",
-    "RobustIdentity", "Screened", "SeenFrame", "SightingFactors", "TrackedIdentities", "gate_threshold", "identify",
+    "AmendableJournal", "AssociatedUnknown", "GatedIdentity", "IdentityParams", "IdentityPolicy",
+    "LandmarkGraph", "MixtureIdentities", "MixtureIdentity", "NamelessLandmarks",
+    "RobustIdentity", "Screened", "SeenFrame", "SightingFactors", "TrackedIdentities",
 ]

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sonar_graph.measurements import Floats
-from sonar_graph.slam.landmarks.association import gate_threshold
+from sonar_graph.models import gate_threshold
 
 UNPAIRED = -1
 

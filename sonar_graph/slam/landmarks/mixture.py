@@ -36,8 +36,8 @@ from pydantic import Field
 
 from sonar_graph.calibration import Section
 from sonar_graph.measurements import Floats, LandmarkDetections
+from sonar_graph.models import Kernel, project_points, wrap_angle
 from sonar_graph.slam.landmarks.sighting import Sighting
-from sonar_graph.slam.models import Kernel
 
 REPEATED_LOSS = 3.0
 """Mean loss, twice or thrice what noise alone gives, to which sightings of one thing that stands still agree."""
@@ -141,8 +141,9 @@ class Errors:
     def of(self, points: Floats) -> Floats:
         """Against landmarks at points of the world, shape (K, 3): range and azimuth, shape (n, K, 2)."""
         q = np.einsum("nji,nkj->nki", self._axes, points[None] - self._origin[:, None])
-        azimuth = np.arctan2(q[..., 1], q[..., 0]) - self._z[:, None, 1]
-        e = np.stack([np.linalg.norm(q, axis=2) - self._z[:, None, 0], np.arctan2(np.sin(azimuth), np.cos(azimuth))], 2)
+        expected, _ = project_points(q.reshape(-1, 3))
+        e = expected.reshape(*q.shape[:2], 2) - self._z[:, None]
+        e[..., 1] = wrap_angle(e[..., 1])
         return np.einsum("nij,nkj->nki", self._whitener, e)
 
     def located(self) -> Floats:
@@ -163,7 +164,7 @@ class Mixture:
     def at_first(self, statement: IdentityPosterior, ids: list[int], z: Floats, expected: Floats, S: Floats) -> Scores:
         """Components of a detection that the state is not yet conditioned on, with its innovation covariances S."""
         e = z - expected
-        e[:, 1] = np.arctan2(np.sin(e[:, 1]), np.cos(e[:, 1]))
+        e[:, 1] = wrap_angle(e[:, 1])
         whitener = np.linalg.inv(np.linalg.cholesky(S))
         log_densities = (
             self._log_peak

@@ -21,6 +21,7 @@ from gtsam.symbol_shorthand import L
 from pydantic import Field
 
 from sonar_graph.measurements import NO_TRACK, LandmarkDetections
+from sonar_graph.models import Kernel
 from sonar_graph.slam.estimates import Solution
 from sonar_graph.slam.landmarks.landmark_graph import Assignment, LandmarkGraph
 from sonar_graph.slam.landmarks.mixture import (
@@ -35,7 +36,6 @@ from sonar_graph.slam.landmarks.mixture import (
 )
 from sonar_graph.slam.landmarks.sighting import Screened, SeenFrame, Sighting, beam_point, late_view
 from sonar_graph.slam.landmarks.tracked import NS_PER_S, GatedIdentity, RobustIdentity, second_rows_of_tracks
-from sonar_graph.slam.models import Kernel
 from sonar_graph.slam.smoother import Marginals, solve_in_sight
 from sonar_graph.states import Outcome
 from sonar_graph.tagged_sections import tagged

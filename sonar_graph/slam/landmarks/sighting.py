@@ -13,20 +13,19 @@ import numpy as np
 
 from sonar_graph.calibration import FloorPrior, SonarCalibration
 from sonar_graph.measurements import Floats, LandmarkDetections
-from sonar_graph.motion import PreintegratedMotion
-from sonar_graph.slam.keyframes import Keyframes
-from sonar_graph.slam.models import (
+from sonar_graph.models import (
     FLOOR_GATE,
-    PredictedView,
     Robust,
-    Source,
     elevation_on_floor,
-    factors,
     locate,
     locate_jacobians,
     range_azimuth_jacobians,
     wrap_angle,
 )
+from sonar_graph.motion import PreintegratedMotion
+from sonar_graph.slam import factors
+from sonar_graph.slam.keyframes import Keyframes
+from sonar_graph.slam.prediction import PredictedView, Source
 from sonar_graph.slam.smoother import Factors, JointCovariance, Sightline
 from sonar_graph.states import Outcome
 

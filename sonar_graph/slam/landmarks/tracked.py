@@ -16,8 +16,8 @@ from pydantic import Field
 
 from sonar_graph.calibration import Section
 from sonar_graph.measurements import NO_TRACK, LandmarkDetections
+from sonar_graph.models import ACCEPTED, MINIMUM_PROBABILITY, gate_threshold, identify
 from sonar_graph.slam.estimates import Solution
-from sonar_graph.slam.landmarks.association import ACCEPTED, MINIMUM_PROBABILITY, gate_threshold, identify
 from sonar_graph.slam.landmarks.landmark_graph import Assignment, LandmarkGraph
 from sonar_graph.slam.landmarks.sighting import Screened, SeenFrame, Sighting, beam_point, late_view
 from sonar_graph.slam.landmarks.unknown import IgnoredUnknown, NamelessLandmarks, UnknownParams, unnamed

@@ -30,12 +30,12 @@ from pydantic import Field
 from sonar_graph.calibration import Section
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats, LandmarkDetections
+from sonar_graph.models import gate_threshold, wrap_angle
 from sonar_graph.slam.keyframes import Keyframes
-from sonar_graph.slam.landmarks.association import gate_threshold
 from sonar_graph.slam.landmarks.joint_compatibility import UNPAIRED, Innovations, believed, log_density, pair_jointly
 from sonar_graph.slam.landmarks.landmark_graph import Assignment, LandmarkGraph
 from sonar_graph.slam.landmarks.sighting import SeenFrame, Sighting, place, source
-from sonar_graph.slam.models import PredictedView, wrap_angle
+from sonar_graph.slam.prediction import PredictedView
 from sonar_graph.slam.smoother import JointCovariance
 from sonar_graph.states import FIRST_ANONYMOUS_ID, Outcome
 from sonar_graph.tagged_sections import tagged

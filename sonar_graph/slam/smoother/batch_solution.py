@@ -22,7 +22,7 @@ import gtsam
 import numpy as np
 
 from sonar_graph.measurements import Floats
-from sonar_graph.slam.biases import BIASES
+from sonar_graph.models import BIASES, project, wrap_angle
 
 MAX_STEPS = 50
 """Steps that a descent may try, whether or not they lower the error: each costs a factorisation of the graph."""
@@ -274,8 +274,9 @@ class Sightline:
     def miss_m(self, values: gtsam.Values, landmark: Floats) -> float:
         """Distance by which range and azimuth miss a point of the world."""
         x, y, z = self._world_T_sonar(values).transformTo(landmark)
-        turn = (math.atan2(y, x) - self.z[1] + math.pi) % (2 * math.pi) - math.pi
-        return math.hypot(math.sqrt(x * x + y * y + z * z) - self.z[0], self.z[0] * turn)
+        expected, _ = project(np.array([x, y, z]))
+        turn_rad = wrap_angle(expected[1] - self.z[1])
+        return math.hypot(expected[0] - self.z[0], self.z[0] * turn_rad)
 
     def _world_T_sonar(self, values: gtsam.Values) -> gtsam.Pose3:
         return values.atPose3(self.pose_key).compose(self.body_T_sonar)

@@ -25,7 +25,7 @@ Labelled = tuple[str, gtsam.NonlinearFactor]
 MARGINAL = "marginal of what left the window"
 LEAST_SAID = 2e-3
 """Standard deviations by metre or radian: the graph gives directions that it leaves to others sigmas of a thousand and
-more (`sonar_graph.slam.models.factors`)."""
+more (`sonar_graph.slam.factors`)."""
 RANK_LIMIT = 1e-9
 OPEN_SHARE = 1e-3
 """Share of a unit vector v from which on a variable takes part in it."""

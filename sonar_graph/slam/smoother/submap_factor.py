@@ -20,7 +20,7 @@ import numpy as np
 
 from sonar_graph.measurements import Floats
 from sonar_graph.numerics import I3, Mat3, Vec3, chord_inverse, compiled, cross, inlined, outer, rotation_log, vec
-from sonar_graph.slam.models import pose, pose_row
+from sonar_graph.slam.odometry_arrays import pose, pose_row
 from sonar_graph.slam.smoother.batch_solution import is_landmark, is_pose, tangent_size
 
 ROUNDING = 1e-6

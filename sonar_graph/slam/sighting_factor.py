@@ -1,6 +1,6 @@
 """Range and azimuth whose noises are correlated, as one factor, and all such factors of a graph at once.
 
-``e = h(X, L) - z ~ N(0, R)``, azimuth wrapped, with h and its derivatives as in `sonar_graph.slam.models.views`. GTSAM
+``e = h(X, L) - z ~ N(0, R)``, azimuth wrapped, with h and its derivatives as in `sonar_graph.models.sonar`. GTSAM
 has no compiled factor of it. One evaluation in Python takes as long as many compiled ones, so that a solution of
 thousands asks for all of them together.
 """
@@ -8,14 +8,14 @@ thousands asks for all of them together.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import gtsam
 import numpy as np
 
 from sonar_graph.measurements import Floats
-from sonar_graph.slam.models.sonar_model import wrap_angle
-from sonar_graph.slam.models.views import poses_of, project_all
+from sonar_graph.models import project_points, view_points, wrap_angle
+from sonar_graph.slam.odometry_arrays import poses_of
 
 UNIT = gtsam.noiseModel.Unit.Create(2)
 
@@ -31,11 +31,24 @@ class SightingError:
 
     def __call__(self, _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:
         """Error, shape (2,), m and rad."""
-        world_T_sonar = values.atPose3(self.keys[0]).compose(self.body_T_sonar).matrix()
-        (predicted,), (by_sonar,), (by_landmark,) = project_all(values.atPoint3(self.keys[1])[None], world_T_sonar)
+        world_T_sonar = values.atPose3(self.keys[0]).compose(self.body_T_sonar)
+        (predicted,), (by_sonar,), (by_landmark,) = view_points(world_T_sonar, values.atPoint3(self.keys[1])[None])
         if jacobians is not None:
             jacobians[0], jacobians[1] = by_sonar @ self.by_body, by_landmark
         return np.array([predicted[0] - self.z[0], wrap_angle(predicted[1] - self.z[1])])
+
+
+class Evaluated(NamedTuple):
+    """Expected range and azimuth of n sightings."""
+
+    z: Floats
+    """Shape (n, 2), m and rad."""
+    D_q: Floats
+    """Derivative by q, shape (n, 2, 3)."""
+    q: Floats
+    """The landmarks in the sonars' axes, shape (n, 3), m."""
+    world_R_sonar: Floats
+    """Shape (n, 3, 3)."""
 
 
 class SightingStack:
@@ -60,23 +73,20 @@ class SightingStack:
 
     def error(self, values: gtsam.Values) -> float:
         """Sum of the kernels' losses."""
-        e, distances = self._whitened(self._evaluated(values)[0])
+        e, distances = self._whitened(self._missed(self._evaluated(values).z))
         losses = 0.5 * np.vecdot(e, e)
         losses[self._robust] = [kernel.loss(d) for kernel, d in zip(self._kernels, distances, strict=True)]
         return float(losses.sum())
 
     def linear_factors(self, values: gtsam.Values) -> list[gtsam.JacobianFactor]:
         """What linearising each of them gives, with the kernels' weights."""
-        e, q, world_R_sonar = self._evaluated(values)
-        e, distances = self._whitened(e)
-        whitening, root = self._whitening, np.ones((len(e), 1))
-        root[self._robust, 0] = np.sqrt([kernel.weight(d) for kernel, d in zip(self._kernels, distances, strict=True)])
-        h2 = q[:, 0] ** 2 + q[:, 1] ** 2
-        D_q = np.zeros((len(q), 2, 3))
-        D_q[:, 0] = q / np.linalg.norm(q, axis=1)[:, None]
-        D_q[:, 1, 0], D_q[:, 1, 1] = -q[:, 1] / h2, q[:, 0] / h2
+        z, D_q, q, world_R_sonar = self._evaluated(values)
+        e, distances = self._whitened(self._missed(z))
+        weights = [kernel.weight(d) for kernel, d in zip(self._kernels, distances, strict=True)]
+        root = np.ones((len(e), 1))
+        root[self._robust, 0] = np.sqrt(weights)
+        D_q = root[..., None] * self._whitening @ D_q  # whitened, with the kernels' weights
         crosses = -np.cross(q[:, None, :], np.eye(3))
-        D_q = root[..., None] * whitening @ D_q
         by_pose = np.concatenate((D_q @ crosses, -D_q), axis=2) @ self._by_body
         by_landmark = D_q @ world_R_sonar.transpose(0, 2, 1)
         make = gtsam.JacobianFactor
@@ -87,16 +97,21 @@ class SightingStack:
             )
         ]
 
-    def _evaluated(self, values: gtsam.Values) -> tuple[Floats, Floats, Floats]:
-        """Errors, shape (n, 2), the landmarks in the sonars' axes, shape (n, 3), and the sonars' rotations."""
+    def _evaluated(self, values: gtsam.Values) -> Evaluated:
+        """Every sighting at these values."""
         poses = poses_of(values, self._pose_keys)
         R, p = poses[:, :9].reshape(-1, 3, 3), poses[:, 9:]
         world_R_sonar = R @ self._body_R_sonar
         points = np.array([values.atPoint3(key) for key in self._landmark_keys])[self._landmarks]
         q = times(world_R_sonar.transpose(0, 2, 1), points - p - times(R, self._body_p_sonar))
-        azimuth = np.arctan2(q[:, 1], q[:, 0]) - self._z[:, 1]
-        wrapped = azimuth - 2 * np.pi * np.ceil((azimuth - np.pi) / (2 * np.pi))
-        return np.column_stack((np.linalg.norm(q, axis=1) - self._z[:, 0], wrapped)), q, world_R_sonar
+        z, D_q = project_points(np.ascontiguousarray(q))
+        return Evaluated(z, D_q, q, world_R_sonar)
+
+    def _missed(self, z: Floats) -> Floats:
+        """Expected minus measured range and azimuth, shape (n, 2)."""
+        e = z - self._z
+        e[:, 1] = wrap_angle(e[:, 1])
+        return e
 
     def _whitened(self, e: Floats) -> tuple[Floats, list[float]]:
         """Whitened errors, and the lengths of those that have a kernel."""

@@ -1,7 +1,7 @@
 """Prediction of a sonar frame from the graph: range and azimuth of landmarks, with covariances.
 
 With the motion M from a keyframe X to the frame, its noise covariance Q, its derivative D by the gyro bias b, and the
-sonar mounted at T, the landmark p is expected at ``h(X M T, p)``, h of `sonar_graph.slam.models.views`. The
+sonar mounted at T, the landmark p is expected at ``h(X M T, p)``, h of `sonar_graph.models.sonar`. The
 expectation has the covariance ``H P H' + H_M Q H_M'``: P of (X, b, p) together, ``H = [H_X, H_M D, H_p]``, H_M the
 derivative by the body's pose at the frame.
 """
@@ -12,8 +12,8 @@ import gtsam
 import numpy as np
 
 from sonar_graph.measurements import Floats
+from sonar_graph.models import view_points, wrap_angle
 from sonar_graph.navigation import PreintegratedMotion
-from sonar_graph.slam.models.views import project_all
 from sonar_graph.slam.smoother import JointCovariance
 
 IDENTITY = np.eye(2)
@@ -113,7 +113,7 @@ class PredictedView:
         Range (m) and azimuth (rad), shape (m + s, 2), and their joint covariance, shape (2 (m + s), 2 (m + s)).
         """
         everywhere = np.array([*points, *(source.point for source in sources)]).reshape(-1, 3) if sources else points
-        predicted, by_sonar, by_point = project_all(everywhere, self.world_T_sonar.matrix())
+        predicted, by_sonar, by_point = view_points(self.world_T_sonar, everywhere)
         rows, P, n = self.covariance.rows, self.covariance.matrix, len(everywhere)
         H = by_sonar @ self._by_state
         for k, key in enumerate(keys):
@@ -135,14 +135,14 @@ class PredictedView:
 
         The motion's part is added to each variance; that it correlates range and azimuth a little is left out.
         """
-        H_M = project_all(points, self.world_T_sonar.matrix())[1] @ self._by_body
+        H_M = view_points(self.world_T_sonar, points).by_sonar @ self._by_body
         return cov + IDENTITY * (H_M @ motion.covariance * H_M).sum(axis=2)[:, None]
 
 
 def weigh(z: Floats, expected: Floats, prior_cov: Floats, cov: Floats) -> ComparedRow:
     """Compare m detections and their noise with what was expected and its covariance."""
     innovation, S = z - expected, prior_cov + cov
-    innovation[:, 1] -= 2.0 * np.pi * np.ceil((innovation[:, 1] - np.pi) / (2.0 * np.pi))
+    innovation[:, 1] = wrap_angle(innovation[:, 1])
     (r, alpha), (a, b, _, c) = innovation.T, S.reshape(-1, 4).T
     distance = (c * r**2 - 2.0 * b * r * alpha + a * alpha**2) / (a * c - b**2)
     gain = np.maximum(prior_cov[:, 0, 0] / cov[:, 0, 0], prior_cov[:, 1, 1] / cov[:, 1, 1])

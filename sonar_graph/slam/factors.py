@@ -25,13 +25,10 @@ import numpy as np
 from sonar_graph.calibration import Calibration, PlanarMotion
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Floats
+from sonar_graph.models import ACCEL, BIASES, COMPASS, HUBER_WIDTHS, Robust, wrap_angle, yaw_and_derivative
 from sonar_graph.navigation import PreintegratedMotion
 from sonar_graph.numerics import cross_matrix
-from sonar_graph.slam.biases import ACCEL, BIASES, COMPASS
-from sonar_graph.slam.models.aiding import HUBER_WIDTHS, yaw_and_derivative
-from sonar_graph.slam.models.correlated_sighting import CorrelatedSighting
-from sonar_graph.slam.models.kernels import Robust
-from sonar_graph.slam.models.sonar_model import wrap_angle
+from sonar_graph.slam.sighting_factor import CorrelatedSighting
 
 UNINFORMATIVE_M = 1e5
 UNINFORMATIVE_RAD = 1e3

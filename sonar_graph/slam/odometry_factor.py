@@ -21,11 +21,10 @@ import gtsam
 import numpy as np
 
 from sonar_graph.measurements import Floats
+from sonar_graph.models import HEADING
 from sonar_graph.motion import PreintegratedMotion
-from sonar_graph.slam.biases import HEADING
-from sonar_graph.slam.models.factors import ORIGIN, gaussian
-from sonar_graph.slam.models.odometry_arrays import odometry_derivatives, odometry_errors
-from sonar_graph.slam.models.views import pose_row, poses_of
+from sonar_graph.slam.factors import ORIGIN, gaussian
+from sonar_graph.slam.odometry_arrays import odometry_derivatives, odometry_errors, pose_row, poses_of
 
 UNIT = gtsam.noiseModel.Unit.Create(6)
 

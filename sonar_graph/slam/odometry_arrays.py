@@ -8,7 +8,9 @@ With ``E = (R, t)``, ``theta = Log(R)`` and V the mean of ``Exp(s theta)`` over 
         [ B V^-T V^-T ]
 """
 
+import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from sonar_graph.measurements import Floats
 from sonar_graph.numerics import (
@@ -140,3 +142,15 @@ def store_columns(A: Mat6, sign: float, out: Floats) -> None:
     for r, (left, right) in enumerate(((T.a, T.b), (T.c, T.d))):
         for i, (v, w) in enumerate(((left.x, right.x), (left.y, right.y), (left.z, right.z))):
             store_vector(Vec6(sign * v, sign * w), out[3 * r + i])
+
+
+def poses_of(values: gtsam.Values, keys: NDArray[np.uint64]) -> Floats:
+    """Poses of a graph by the keys of keyframes, shape (...): rows of R, and p, shape (..., 12)."""
+    known = np.fromiter(values.keys(), np.uint64)
+    poses = np.asarray(gtsam.utilities.extractPose3(values))  # by ascending key
+    return poses[np.searchsorted(known[known >> np.uint64(56) == ord("x")], keys)]
+
+
+def pose_row(pose: gtsam.Pose3) -> Floats:
+    """Rows of R, and p, shape (12,)."""
+    return np.concatenate((pose.rotation().matrix().ravel(), pose.translation()))

@@ -1,0 +1,28 @@
+"""Measurement models, below every estimator: what a sensor measures at a state, its derivatives and its noise.
+
+sonar.py       range and azimuth of a landmark, and the inverse
+aiding.py      headings and position fixes, with Huber's kernel
+biases.py      biases that last through a run, and what they do to a motion
+kernels.py     robust kernels of range and azimuth
+identity.py    acceptance of a recogniser's identities, and the gate
+"""
+
+# fmt: off
+from sonar_graph.models.aiding import HUBER_WIDTHS, Contradictions, doubted, yaw_and_derivative
+from sonar_graph.models.biases import (
+    ACCEL, BIASES, COMPASS, HEADING, SCALE, TILT, bias_sigmas, by_biases, gyro_bias_of,
+)
+from sonar_graph.models.identity import ACCEPTED, MINIMUM_PROBABILITY, gate_threshold, identify
+from sonar_graph.models.kernels import GaussianKernel, Kernel, KernelParams, Robust, RobustKernel
+from sonar_graph.models.sonar import (
+    FLOOR_GATE, elevation_on_floor, locate, locate_jacobians, project, project_points, range_azimuth,
+    range_azimuth_jacobians, sonar_point, sonar_point_jacobian, view_points, wrap_angle,
+)
+
+__all__ = [
+    "ACCEL", "ACCEPTED", "BIASES", "COMPASS", "Contradictions", "FLOOR_GATE", "GaussianKernel", "HEADING",
+    "HUBER_WIDTHS", "Kernel", "KernelParams", "MINIMUM_PROBABILITY", "Robust", "RobustKernel", "SCALE", "TILT",
+    "bias_sigmas", "by_biases", "doubted", "elevation_on_floor", "gate_threshold", "gyro_bias_of", "identify",
+    "locate", "locate_jacobians", "project", "project_points", "range_azimuth", "range_azimuth_jacobians",
+    "sonar_point", "sonar_point_jacobian", "view_points", "wrap_angle", "yaw_and_derivative",
+]
