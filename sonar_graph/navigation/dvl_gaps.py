@@ -305,6 +305,7 @@ def _walk(
     """
     k = int(rows.dvl_ns.searchsorted(start_ns))
     T = (end_ns - start_ns) * 1e-9
+    # a walk is white noise of the velocity, integrated: variance q^2 T^3 / 12 or / 3 of the displacement
     walked = (sensors.velocity_walk_density * T) ** 2 * np.eye(3)
     if doppler_psd is None:
         dvl_ns = np.array([start_ns - NS_PER_S, start_ns])
@@ -322,6 +323,7 @@ def remaining_motion(before: PreintegratedMotion, whole: PreintegratedMotion) ->
     """The rest of a whole motion after a first part of it, with the growth of its error."""
     motion = before.i_T_j.between(whole.i_T_j)
     A = motion.inverse().AdjointMap()
+    # growth of the error; rounding may leave an eigenvalue below zero
     grown = whole.covariance - A @ before.covariance @ A.T
     variances, axes = np.linalg.eigh(0.5 * (grown + grown.T))
     duration_s = whole.duration_s - before.duration_s

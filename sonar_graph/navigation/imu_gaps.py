@@ -85,6 +85,7 @@ def hole_ns(stamps: Ints, rows: int, row: int, until_ns: int) -> int:
     length_ns = (stamps[row] if row < rows else until_ns) - stamps[last]
     if length_ns <= SHORTEST_NS:
         return 0
+    # rows may be lost or jitter: only intervals far longer than usual are holes
     typical = typical_ns(stamps, last)
     longest_ns = HOLE_INTERVALS * typical if typical > 0 else UNTYPICAL_NS
     return length_ns if length_ns > longest_ns else 0
@@ -113,6 +114,7 @@ def error_in_hole(turns: Turns, stamps: Ints, rows: int, row: int, t: int, until
             closed_variance(turns.sigma[1], turns.time_s[1], T) / T + noise,
             closed_variance(turns.sigma[2], turns.time_s[2], T) / T + noise,
         )
+    # open: what has grown since t, of a variance that counts from the last row
     T = (until_ns - stamps[last]) * 1e-9
     before_s = (t - stamps[last]) * 1e-9
     noise = by_row * (T + before_s)

@@ -138,6 +138,7 @@ class Odometry:
     def forget_before(self, epoch_ns: int) -> None:
         """Settle, and drop rows that no motion from this epoch on can need, gaps after it included."""
         self.settle(epoch_ns)
+        # a gap that opens at the epoch is bridged by a line through the window before it
         needed_ns = epoch_ns if self._hold_past else epoch_ns - WINDOW_NS
         self._imu.forget_before(needed_ns, ROWS_BEFORE)
         self._dvl.forget_before(needed_ns)
@@ -152,6 +153,7 @@ class Odometry:
         if not len(covered) or covered[0] > imu_ns[-1]:
             return None
         first_ns = int(covered[0])
+        # a clock that was set after the first rows of the IMU
         if first_ns - imu_ns[0] > PAUSE_NS:
             self._intake.refuse_imu_before(first_ns - PAUSE_NS)
             return self.start_by(until_ns)
@@ -168,6 +170,7 @@ class Odometry:
         imu_ns = self._imu.stamps_ns
         known_ns = self._dvl.values[2]
         epochs_ns = self._dvl.stamps_ns[first:last]
+        # stamp of the IMU row that covers each epoch
         covered_ns = imu_ns[imu_ns.searchsorted(epochs_ns)]
         return epochs_ns, np.maximum(covered_ns, known_ns[first:last])
 
@@ -314,6 +317,7 @@ class Odometry:
 @compiled
 def _epochs_between(after_ns: int, until_ns: int, imu_ns: Ints, dvl_ns: Ints, known_ns: Ints) -> tuple[int, int]:
     """First and last row (exclusive) of `Odometry.epochs`."""
+    # an epoch needs an IMU row at or after it, and a velocity that is known
     seen = rows_until(imu_ns, until_ns)
     first = rows_until(dvl_ns, after_ns)
     last = 0

@@ -229,6 +229,7 @@ class Stretch(NamedTuple):
         sums = self.sums[0]
         i_T_j = gtsam.Pose3(gtsam.Rot3(sums[:3]), sums[P])
         T = (self.until_ns - self.start_ns) * 1e-9
+        # over no time there is no mean
         mean_force = sums[IMPULSE] / T if T > 0 else np.full(3, np.nan)
         motion = PreintegratedMotion(i_T_j, self.C, self.D, self.bias, T, mean_force)
         return motion if self.before is None else self.before.then(motion)
@@ -300,6 +301,7 @@ def add_steps(
         rr = mat(sums, (at + RR, 0))
         D_t = mat(sums, (at + D_T, 0))
         D_r = mat(sums, (at + D_R, 0))
+        # NaN marks the interval for the caller, who bridges the gap
         if has_gap(rows.dvl_ns, dvl_rows, k, t, end, intervals.longest_ns):
             t = end
             R = np.nan * I3
@@ -353,12 +355,14 @@ def add_steps(
 @inlined
 def step_from(rows: Rows, imu_rows: int, dvl_rows: int, i: int, k: int, t: int, end_ns: int) -> Step:
     """Step from t to the next stamp or the end, by the first rows of each sensor; rows i and k follow t."""
+    # cut at the next stamp of either sensor
     until = end_ns
     if i < imu_rows:
         until = min(until, rows.imu_ns[i])
     if k < dvl_rows:
         until = min(until, rows.dvl_ns[k])
     middle = t + (until - t) // 2
+    # past the last row its own noise holds, and the interval before it
     last = min(k, dvl_rows - 1)
     other = last if rows.hold_past or k >= dvl_rows or last == 0 else last - 1
     interval_s = (rows.dvl_ns[last] - rows.dvl_ns[last - 1]) * 1e-9 if last > 0 else 0.0
@@ -393,6 +397,7 @@ def hole_from(rows: Rows, imu_rows: int, dvl_rows: int, i: int, k: int, t: int, 
     imu_ns = rows.imu_ns
     if not rows.turns.is_modelled:
         return ImuHole(end_ns, ZERO, ZERO)
+    # an open hole grows from DVL stamp to DVL stamp, so that cutting at them changes nothing
     until = end_ns
     if i < imu_rows:
         until = min(until, imu_ns[i])
@@ -402,6 +407,7 @@ def hole_from(rows: Rows, imu_rows: int, dvl_rows: int, i: int, k: int, t: int, 
     if length_ns > 0:
         unfelt = NOWHERE if length_ns > UNFELT_NS else ZERO
         return ImuHole(until, error_in_hole(rows.turns, imu_ns, imu_rows, i, t, until), unfelt)
+    # no hole before the next interval that is long enough to be one
     while i + 1 < imu_rows and imu_ns[i] < end_ns and imu_ns[i + 1] - imu_ns[i] <= SHORTEST_NS:
         i += 1
     return ImuHole(min(end_ns, imu_ns[i]) if i < imu_rows else until, ZERO, ZERO)

@@ -212,9 +212,11 @@ def match_dvl_to_imu(imu: Imu, dvl: Dvl, calibration: Calibration) -> DvlMatch:
     scale = 1.0
     gyro_bias = np.zeros(3)
     for done in range(1, ROUNDS + 1):
+        # integrated again with the gyro bias found so far: the model is linearised about it
         path = InertialPath.of(Imu(imu.stamps_ns, imu.angular_velocity - gyro_bias, imu.specific_force))
         turned = scale * Rotation.from_rotvec([0.0, 0.0, yaw]).apply(velocity)
         line_up = partial(velocity_changes, path, seconds, turned, runs, lever)
+        # small matrices: threads of BLAS would only cost
         with threadpool_limits(1, user_api="blas"):
             found = search_offset(line_up, PRIOR_SIGMAS)
             found = found.without_shared_noise(line_up(found.offset_s), SCALE)

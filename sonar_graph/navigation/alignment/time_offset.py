@@ -191,6 +191,7 @@ class NormalEquations:
 
 def _orthonormal(B: Floats) -> tuple[Floats, float]:
     """A basis of the columns' span, and ``log|B'B|`` over it."""
+    # without parameters of their own there is nothing to project out
     if not B.shape[1]:
         return B, 0.0
     U, s, _ = np.linalg.svd(B, full_matrices=False)
@@ -262,6 +263,7 @@ def search_offset(line_up: LineUp, prior_sigmas: Floats) -> OffsetFit:
     ``line_up``: gives the data for an offset; the same rows for all of them; ``prior_sigmas``: of the other common
     parameters (see `sonar_graph.navigation.alignment.time_offset.fit`), shape (p,).
     """
+    # wide first: the criterion has several minima for a periodic motion
     grid = np.arange(-RANGE_S, RANGE_S + GRID_STEP_S / 2, GRID_STEP_S)
     lined_up = [line_up(float(offset)) for offset in grid]
     ratios = fit(lined_up[len(grid) // 2], prior_sigmas).ratios

@@ -87,6 +87,7 @@ class RowIntake:
             return False
         rate = rows.angular_velocity
         force = rows.specific_force
+        # a fault of the transmission: the row is refused whole
         beyond = (np.abs(rate) > MOST_RATE_RAD_S) | (np.abs(force) > MOST_FORCE_M_S2)
         if beyond.any():
             is_used = np.asarray(~beyond.any(axis=1))
@@ -96,6 +97,7 @@ class RowIntake:
             rows = rows.rows(is_used)
             rate = rate[is_used]
             force = force[is_used]
+        # the calibration's bias is along the sensor's axes
         if self._gyro_bias.any():
             rate = rate - self._gyro_bias
         if self._body_R_imu is not None:
@@ -162,6 +164,7 @@ class RowIntake:
             return None
         velocity = rows.velocity
         cov = rows.velocity_cov
+        # most covariances are diagonal: no eigenvalues needed
         if not _is_dominant(cov):
             is_sound, cov = self._judged(cov)
             if not is_sound.all():
