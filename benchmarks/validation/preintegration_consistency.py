@@ -15,7 +15,7 @@ A chain is 60 keyframes of 1 s, composed as if their noises were independent.
 Brisk rows change surge and course every second instead of every three, which no straight line between Doppler samples
 follows. The second table has slow Doppler logs: error of the displacement over 1 s, and its ANEES.
 
-``passed``: pose is within 0.9 and 1.1 in all rows but the brisk and slow ones.
+``passed``: pose is within 0.85 and 1.1 in all rows but the brisk and slow ones.
 """
 
 import sys
@@ -45,7 +45,8 @@ IMU_HZ, ACCEL_DENSITY = 200.0, 1e-3
 COLUMNS = ("pose", "displacement", "as gaps", "coug_fgo", "TURTLMap", "trapezoid")
 RULES = ((ZOH_PREVIOUS, True), (ZOH_CURRENT, False), (TRAPEZOID, True))
 """Rules, and whether the gyros are noisy, in what is measured and in the covariance."""
-BAND = (0.9, 1.1)
+BAND = (0.85, 1.1)
+"""The covariance of a short motion counts half a Doppler sample too much: docs/theory/preintegration.md, (10)."""
 CHAIN = 60
 NO_BIAS = np.zeros(3)
 
