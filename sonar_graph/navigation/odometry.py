@@ -285,7 +285,7 @@ class Odometry:
         Gaps between epochs are bridged; between gaps the motion is one sum of steps. ``whole_end_ns``: as for
         `open_bridge`.
         """
-        rows = self.rows().known(known_ns)
+        rows = self.rows()
         sensors = self._sensors
         epochs_ns = self.epochs(start_ns - 1, known_ns)
         epochs_ns = epochs_ns[: epochs_ns.searchsorted(end_ns, side="right")]
@@ -301,17 +301,19 @@ class Odometry:
             for k in np.flatnonzero(np.diff(new_ns) > sensors.longest_ns).tolist():
                 lost_ns = int(new_ns[k])
                 found_ns = int(new_ns[k + 1])
-                before = stretch.continued(rows, sensors, removed, lost_ns).motion
-                over_gap = closed_bridge(rows, sensors, removed.after(before), lost_ns, found_ns)
+                before = stretch.continued(rows, sensors, removed, lost_ns, known_ns).motion
+                over_gap = closed_bridge(rows.known(known_ns), sensors, removed.after(before), lost_ns, found_ns)
                 stretch = Stretch.begin(found_ns, removed.bias, before.then(over_gap))
-            stretch = stretch.continued(rows, sensors, removed, newest_ns)
+            stretch = stretch.continued(rows, sensors, removed, newest_ns, known_ns)
         self._kept = Kept(key, stretch)
 
         # from the newest epoch on: provisional, and not kept
         if len(epochs_ns) and self.is_gap(newest_ns, end_ns):
             before = stretch.motion
-            return before.then(open_bridge(rows, sensors, removed.after(before), newest_ns, end_ns, whole_end_ns))
-        return stretch.continued(rows, sensors, removed, end_ns).motion
+            here = removed.after(before)
+            since_lost = open_bridge(rows.known(known_ns), sensors, here, newest_ns, end_ns, whole_end_ns)
+            return before.then(since_lost)
+        return stretch.continued(rows, sensors, removed, end_ns, known_ns).motion
 
 
 @compiled

@@ -209,14 +209,16 @@ class Stretch(NamedTuple):
         """A stretch without steps."""
         return cls(start_ns, start_ns, bias, before, START, np.zeros((6, 6)), np.zeros((6, 3)))
 
-    def continued(self, rows: Rows, sensors: Sensors, removed: Removed, end_ns: int) -> Stretch:
-        """The stretch until a later instant.
+    def continued(
+        self, rows: Rows, sensors: Sensors, removed: Removed, end_ns: int, known_ns: int = LATEST_NS
+    ) -> Stretch:
+        """The stretch until a later instant, by rows that are known at an instant.
 
         Velocities are linear or held however far apart the samples are: gaps are for the caller to find.
         """
         if end_ns == self.until_ns:
             return self
-        intervals = Intervals(np.array([self.until_ns]), np.array([end_ns]), LATEST, LATEST_NS)
+        intervals = Intervals(np.array([self.until_ns]), np.array([end_ns]), np.array([known_ns]), LATEST_NS)
         sums = self.sums.copy()
         # the Earth's rotation is known in the frame where the motion begins
         here = removed.after(self.before)
@@ -233,9 +235,6 @@ class Stretch(NamedTuple):
         mean_force = sums[IMPULSE] / T if T > 0 else np.full(3, np.nan)
         motion = PreintegratedMotion(i_T_j, self.C, self.D, self.bias, T, mean_force)
         return motion if self.before is None else self.before.then(motion)
-
-
-LATEST = np.array([LATEST_NS])
 
 
 def motion_over(rows: Rows, sensors: Sensors, removed: Removed, start_ns: int, end_ns: int) -> PreintegratedMotion:

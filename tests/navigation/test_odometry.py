@@ -408,9 +408,9 @@ def test_what_is_final_is_not_integrated_again(monkeypatch):
 
     continued = Stretch.continued
 
-    def counted(stretch, rows, sensors, removed, end_ns):
+    def counted(stretch, rows, sensors, removed, end_ns, known_ns):
         spans_s.append((end_ns - stretch.until_ns) * 1e-9)
-        return continued(stretch, rows, sensors, removed, end_ns)
+        return continued(stretch, rows, sensors, removed, end_ns, known_ns)
 
     monkeypatch.setattr(Stretch, "continued", counted)
     odometry = swaying()
