@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import gtsam
+import numpy as np
 
 from sonar_graph.calibration import Calibration, require_calibration
 from sonar_graph.errors import CalibrationError
@@ -56,8 +57,14 @@ class PreintegratedMotion:
 
         ``i_T_k = i_T_j j_T_k``; a perturbation of the first reaches frame k through ``Ad(j_T_k^-1)``.
         """
+        # over no time nothing moves, and there is no mean force
+        if self.duration_s == 0.0:
+            return next_motion
+        if next_motion.duration_s == 0.0:
+            return self
         A = next_motion.i_T_j.inverse().AdjointMap()
-        i_R_j, duration_s = self.i_T_j.rotation().matrix(), self.duration_s + next_motion.duration_s
+        i_R_j = self.i_T_j.rotation().matrix()
+        duration_s = self.duration_s + next_motion.duration_s
         impulse = self.mean_specific_force * self.duration_s
         impulse += i_R_j @ next_motion.mean_specific_force * next_motion.duration_s
         return PreintegratedMotion(
@@ -72,6 +79,18 @@ class PreintegratedMotion:
     def corrected(self, bias: Floats) -> gtsam.Pose3:
         """i_T_j for another gyro bias, to first order: ``i_T_j Exp(D_bias (bias - self.bias))``."""
         return self.i_T_j.compose(gtsam.Pose3.Expmap(self.D_bias @ (bias - self.bias)))
+
+
+EARTH_RATE_RAD_S = 7.292115e-5
+"""WGS 84."""
+
+
+def earth_rate_in_world(calibration: Calibration) -> Floats | None:
+    """Earth's angular rate in a world with x east, y north, z up, shape (3,), rad/s; None without a latitude."""
+    latitude = calibration.earth_rate_latitude_rad
+    if latitude is None:
+        return None
+    return EARTH_RATE_RAD_S * np.array([0.0, np.cos(latitude), np.sin(latitude)])
 
 
 def require_source(odometry: object, calibration: Calibration, call: str) -> None:
@@ -121,7 +140,7 @@ class MotionSource(Protocol):
     Examples
     --------
     >>> from sonar_graph import Calibration, Odometry
-    >>> from sonar_graph.navigation import MotionSource
+    >>> from sonar_graph.motion import MotionSource
     >>> source: MotionSource = Odometry(Calibration())
     """
 

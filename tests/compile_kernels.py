@@ -24,15 +24,12 @@ def filters() -> str:
 
 
 def smoother() -> str:
-    """Dead reckoning, iSAM2 and joint preintegration."""
+    """Dead reckoning and iSAM2."""
     from sonar_graph import compare
-    from sonar_graph.navigation import JointPreintegrator
     from sonar_graph.testing import small_world
 
     world = small_world()
     compare(world, ["isam2", "dead-reckoning"])
-    joint = JointPreintegrator.from_calibration(world.calibration)
-    joint.integrate(world.imu, world.dvl, *world.dvl.stamps_ns[[0, 5]].tolist())
     return "smoother"
 
 

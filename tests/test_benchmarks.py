@@ -113,18 +113,22 @@ def test_preintegration_names_its_figures():
     found = figures("performance/preintegration.py")
     assert found["gtsam_cpp_ratio"] == pytest.approx(found["ours_ns"] / found["gtsam_cpp_ns"], rel=1e-3)
     assert found["gtsam_python_ratio"] > 1
-    assert len(found["factor_us"]) == 5
+    assert found["gtsam_python_ratio"] > found["with_add_ratio"]
+    assert len(found["factor_us"]) == 3
     assert found["factor_us"]["OdometryWithBias (Python)"] > found["factor_us"]["BetweenFactorPose3 (compiled)"]
 
 
 @pytest.mark.slow
 def test_preintegration_consistency_tells_rules_apart():
     found = figures("validation/preintegration_consistency.py", "--workers", "2")
-    low, high = found["keyframe_joint_anees"]
-    assert 0.8 < low < high < 1.2
+    low, high = found["keyframe_pose_anees"]
+    assert 0.7 < low < high < 1.2
     assert found["keyframe_coug_fgo_anees"][1] > 5
     assert found["keyframe_TURTLMap_anees"][1] > 5
-    assert {"chain_joint_anees", "brisk_linear_anees", "passed"} <= set(found)
+    ours_mm, anees, gaps_mm, gaps_anees = found["brisk, 1 Hz rms_mm, anees, as gaps"]
+    assert ours_mm > 4 * gaps_mm
+    assert anees > 10 > 1.5 > gaps_anees
+    assert {"chain_pose_anees", "brisk_displacement_anees", "passed"} <= set(found)
 
 
 @pytest.mark.slow
@@ -221,19 +225,6 @@ def test_isam2_settings_names_what_they_do(recordings):
         ratio, _, sigmas = found[f"{world}, relinearised at 0.0001"]
         assert ratio == pytest.approx(1.0, abs=1e-3)
         assert sigmas < found[f"{world}, relinearised at 0.01"][2] < 0.2
-
-
-@pytest.mark.slow
-@pytest.mark.recording
-def test_odometry_rows_names_what_accelerometers_add(recordings):
-    found = figures("validation/odometry_rows.py", "--data", str(recordings), "--workers", "2")
-    linear_mm, inertial_mm, gap_mm, linear_nees, inertial_nees, gap_nees = found["brisk, 1 Hz rms_mm, nees"]
-    assert linear_mm > 4 * max(inertial_mm, gap_mm)
-    assert linear_nees > 10
-    assert 0.7 < min(inertial_nees, gap_nees) <= max(inertial_nees, gap_nees) < 1.3
-    assert 0.8 < found["basin 12"][0] < 1.2
-    # An IMU in the wrong place and an Earth at rest show in chi-square, the right calibration does not.
-    assert found["A-KIT IMU at the reference's point"][0] > found["A-KIT Earth at rest"][0] > 2 > found["A-KIT 12"][0]
 
 
 @pytest.mark.slow

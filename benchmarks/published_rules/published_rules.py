@@ -3,9 +3,9 @@
 * `PlainIsam2`: the graph of a GTSAM tutorial (`PlanarSLAMExample`, `iSAM2`): Gaussian noise, no gate, no robust kernel,
   no gyro bias, default parameters of ``gtsam.ISAM2``, every frame with detections a pose.
 * `HeldVelocity`: iSAM2 as ours, with a Doppler velocity held until the next sample and turned by the rotation of the
-  middle of the interval, as coug_fgo integrates it ("zoh-previous").
+  middle of the interval, as coug_fgo integrates it.
 * `NewestVelocity`: the same with the sample at the end of each interval, turned by the rotation there, as TURTLMap
-  (Song, Nieto-Granda et al., 2024) preintegrates it ("zoh-current").
+  (Song, Nieto-Granda et al., 2024) preintegrates it.
 
 Both rules: docs/theory/preintegration.md. What is not theirs (screening of outliers, gaps of the Doppler log, motion to
 instants between its samples, noise of the gyros) is ours in all rows, so that a row differs in its rule alone. Names of
@@ -17,20 +17,20 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import L, X
+from scipy.spatial.transform import Rotation
 
 from sonar_graph import Calibration, Odometry
 from sonar_graph.calibration import Section
-from sonar_graph.errors import MeasurementError
-from sonar_graph.measurements import Depth, Dvl, Floats, Imu, LandmarkDetections, Measurements
+from sonar_graph.measurements import Depth, Floats, LandmarkDetections, Measurements
 from sonar_graph.models import ACCEPTED, MINIMUM_PROBABILITY, elevation_on_floor, identify, locate
 from sonar_graph.motion import MotionSource, PreintegratedMotion
-from sonar_graph.navigation import JointPreintegrator
-from sonar_graph.navigation.joint_preintegration import DopplerRule
+from sonar_graph.navigation.preintegration import Rows, Sensors
+from sonar_graph.numerics import running_rotations
 from sonar_graph.slam import Isam2, factors
 from sonar_graph.states import (
     OUTCOME_NUMBERS,
@@ -46,6 +46,7 @@ from sonar_graph.states import (
 
 NO_BIAS = np.zeros(3)
 DEPTH_IS_NEW_NS = 1_000_000_000
+LONGEST_HOLE_NS = 50_000_000
 OUTCOMES = {number: outcome for outcome, number in OUTCOME_NUMBERS.items()}
 
 
@@ -182,23 +183,81 @@ class PlainIsam2:
         self._pose, self._covariance = self._isam.calculateEstimatePose3(newest), self._isam.marginalCovariance(newest)
 
 
+class DopplerRule(NamedTuple):
+    """Velocity between two Doppler samples, and the rotation that turns it."""
+
+    later: float
+    """Share of the later sample; the rest is that of the earlier one."""
+    turned_at: float
+    """Instant of the rotation, as a share of the interval."""
+
+
+ZOH_PREVIOUS = DopplerRule(later=0.0, turned_at=0.5)
+ZOH_CURRENT = DopplerRule(later=1.0, turned_at=1.0)
+TRAPEZOID = DopplerRule(later=0.5, turned_at=0.5)
+
+
+def motion_by_rule(
+    rows: Rows, rule: DopplerRule, start_ns: int, end_ns: int, bias: Floats, sensors: Sensors
+) -> PreintegratedMotion:
+    """Motion between two epochs by a rule, and its covariance by gyro noise and the samples with their weights.
+
+    ``s = sum_k T_k R_k v_k`` over the Doppler intervals. With x(t) minus what s gains after t, an error theta of the
+    gyros at t changes s by ``[x]x theta``.
+    """
+    k = slice(*np.searchsorted(rows.dvl_ns, [start_ns, end_ns + 1]))
+    epochs_ns = rows.dvl_ns[k]
+    intervals_ns = np.diff(epochs_ns)
+    turned_ns = epochs_ns[:-1] + np.floor(rule.turned_at * intervals_ns).astype(np.int64)
+    within = rows.imu_ns[(rows.imu_ns > start_ns) & (rows.imu_ns < end_ns)]
+    cuts_ns = np.unique(np.concatenate([epochs_ns, turned_ns, within]))
+    middles_ns = cuts_ns[:-1] + np.diff(cuts_ns) // 2
+    dt = np.diff(cuts_ns) * 1e-9
+    since = rows.imu_ns - start_ns
+    rate = np.column_stack([np.interp(middles_ns - start_ns, since, column) for column in rows.rate.T]) - bias
+    R = running_rotations(rate * dt[:, None])  # at the cuts
+    R_mid = R[:-1] @ Rotation.from_rotvec(0.5 * rate * dt[:, None]).as_matrix()
+
+    z = rows.velocity[k]
+    v = (1.0 - rule.later) * z[:-1] + rule.later * z[1:]
+    used = np.searchsorted(cuts_ns, turned_ns)
+    turned = R[used] * (intervals_ns * 1e-9)[:, None, None]
+    gains = np.zeros((len(cuts_ns), 3))
+    gains[used] = (turned @ v[:, :, None])[:, :, 0]
+    s = gains.sum(axis=0)
+    x = np.cumsum(gains, axis=0)[:-1] - s
+    X = np.array([gtsam.SO3.Hat(one) for one in x])
+    weights = np.zeros((len(z), 3, 3))
+    weights[:-1] += (1.0 - rule.later) * turned
+    weights[1:] += rule.later * turned
+
+    n_g2 = sensors.gyro_density**2
+    C, D = np.zeros((6, 6)), np.zeros((6, 3))
+    C[:3, :3] = n_g2 * dt.sum() * np.eye(3)
+    C[3:, :3] = n_g2 * np.einsum("n,nij->ij", dt, X)
+    C[:3, 3:] = C[3:, :3].T
+    C[3:, 3:] = n_g2 * np.einsum("n,nij,nkj->ik", dt, X, X) + np.sum(weights @ rows.cov[k] @ weights.mT, axis=0)
+    D[:3] = -np.einsum("n,nij->ij", dt, R_mid)
+    D[3:] = -np.einsum("n,nij,njk->ik", dt, X, R_mid)
+
+    # from the log's displacement to the body's: p = s - R l + l
+    i_R_j, lever = R[-1], sensors.body_p_dvl
+    J = np.eye(6)
+    J[3:, :3] = gtsam.SO3.Hat(i_R_j @ lever)
+    J = np.kron(np.eye(2), i_R_j.T) @ J
+    pose = gtsam.Pose3(gtsam.Rot3(i_R_j), s - i_R_j @ lever + lever)
+    return PreintegratedMotion(pose, J @ C @ J.T, J @ D, bias, float(dt.sum()), np.full(3, np.nan))
+
+
 class RuleOdometry(Odometry):
     """Motion with the velocity between Doppler samples by another rule; between other instants, and over gaps, ours."""
 
     rule: DopplerRule
 
-    def __init__(self, calibration: Calibration) -> None:
-        super().__init__(calibration)
-        imu, dvl = calibration.imu, calibration.dvl
-        # rows are in body axes
-        mountings = (gtsam.Pose3(gtsam.Rot3(), one.mounting.pose().translation()) for one in (imu, dvl))
-        noise = imu.gyro_noise_density, imu.accel_noise_density, dvl.velocity_sigma_m_s
-        self._preintegrator = JointPreintegrator(*noise, *mountings, self.rule, dvl.gap_s)
-
     def motion(
         self, start_ns: int, end_ns: int, bias: Floats, world_R_i: Floats | None = None, known_ns: int | None = None
     ) -> PreintegratedMotion:
-        """Motion by the rule where both instants are epochs and no gap lies between them."""
+        """Motion by the rule where both instants are epochs and neither a gap nor a hole of the IMU lies between."""
         ours = super().motion(start_ns, end_ns, bias, world_R_i, known_ns)
         epochs_ns = self.epochs(start_ns - 1, end_ns if known_ns is None else known_ns)
         epochs_ns = epochs_ns[: np.searchsorted(epochs_ns, end_ns, side="right")]
@@ -206,25 +265,23 @@ class RuleOdometry(Odometry):
         if not are_ends or any(self.is_gap(a, b) for a, b in pairwise(epochs_ns.tolist())):
             return ours
         rows = self.rows()
-        imu = Imu(rows.imu_ns, rows.rate, rows.force)
-        doppler = Dvl(rows.dvl_ns, rows.velocity, rows.cov)
-        try:
-            by_rule = self._preintegrator.integrate(imu, doppler, start_ns, end_ns, np.append(bias, NO_BIAS))
-        except MeasurementError:  # a hole of the IMU, which no rule bridges
+        first, last = np.searchsorted(rows.imu_ns, [start_ns, end_ns])
+        if (np.diff(rows.imu_ns[max(first - 1, 0) : last + 1]) > LONGEST_HOLE_NS).any():
             return ours
-        return replace(by_rule.relative_pose(), mean_specific_force=ours.mean_specific_force)
+        by_rule = motion_by_rule(rows, self.rule, start_ns, end_ns, bias, Sensors.of(self.calibration))
+        return replace(by_rule, mean_specific_force=ours.mean_specific_force)
 
 
 class HeldVelocityOdometry(RuleOdometry):
     """coug_fgo's rule."""
 
-    rule = "zoh-previous"
+    rule = ZOH_PREVIOUS
 
 
 class NewestVelocityOdometry(RuleOdometry):
     """TURTLMap's rule."""
 
-    rule = "zoh-current"
+    rule = ZOH_CURRENT
 
 
 class HeldVelocity(Isam2):

@@ -15,15 +15,16 @@ import numpy as np
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Dvl, Floats, Imu
-from sonar_graph.navigation import MovedPoses, Odometry
+from sonar_graph.navigation import Odometry
 from sonar_graph.states import Estimate
 
+EARLIEST_NS = -(2**63)
 BIAS = np.zeros(3)
 """Gyro bias: a contract of estimates has none. Over half a second 1e-3 rad/s turns by 5e-4 rad."""
 
 
 class Prediction(NamedTuple):
-    """Poses at an instant, as matrices, of which `gtsam.Pose3` would take longer to make than the prediction.
+    """Poses at an instant, as matrices.
 
     Examples
     --------
@@ -41,7 +42,7 @@ class Prediction(NamedTuple):
     odom_T_body: Floats
     """Shape (4, 4)."""
     velocity_m_s: Floats
-    """Of the IMU's point at the newest epoch, body axes, shape (3,)."""
+    """Of the IMU's point at the newest epoch, body axes, shape (3,); NaN before the first."""
 
 
 class Predictor:
@@ -65,15 +66,13 @@ class Predictor:
 
     def __init__(self, calibration: Calibration) -> None:
         self._odometry = Odometry(calibration)
-        self._poses = MovedPoses(self._odometry)
         self._estimate: Estimate | None = None
         self._odom_T_estimate = gtsam.Pose3()
         self._newest_ns = 0
 
     def add(self, imu: Imu | None, dvl: Dvl | None) -> None:
         """Take in rows as they come."""
-        if self._odometry.add(imu, dvl):
-            self._poses.sum_anew()
+        self._odometry.add(imu, dvl)
         if imu is not None:
             self._newest_ns = max(self._newest_ns, int(imu.stamps_ns[-1]))
 
@@ -86,8 +85,6 @@ class Predictor:
             step = self._odometry.motion(before.stamp_ns, estimate.stamp_ns, BIAS, known_ns=self._newest_ns)
             self._odom_T_estimate = self._odom_T_estimate.compose(step.i_T_j)
         self._estimate = estimate
-        in_both = np.array([estimate.world_T_body.matrix(), self._odom_T_estimate.matrix()])
-        self._poses.begin(estimate.stamp_ns, in_both, estimate.covariance)
         self._odometry.forget_before(estimate.stamp_ns)
 
     @property
@@ -99,8 +96,26 @@ class Predictor:
 
     def predict(self) -> Prediction | None:
         """Poses at the newest IMU row; None before the first estimate."""
-        if self._estimate is None:
+        estimate = self._estimate
+        if estimate is None:
             return None
-        newest_ns = max(self._newest_ns, self._estimate.stamp_ns)
-        (world_T_body, odom_T_body), covariance, velocity = self._poses.at(newest_ns)
-        return Prediction(newest_ns, world_T_body, covariance, odom_T_body, velocity)
+        newest_ns = max(self._newest_ns, estimate.stamp_ns)
+        motion = self._odometry.motion(estimate.stamp_ns, newest_ns, BIAS)
+        A = motion.i_T_j.inverse().AdjointMap()
+        world_T_body = estimate.world_T_body.compose(motion.i_T_j)
+        odom_T_body = self._odom_T_estimate.compose(motion.i_T_j)
+        return Prediction(
+            newest_ns,
+            np.ascontiguousarray(world_T_body.matrix()),
+            A @ estimate.covariance @ A.T + motion.covariance,
+            np.ascontiguousarray(odom_T_body.matrix()),
+            self._velocity(newest_ns),
+        )
+
+    def _velocity(self, until_ns: int) -> Floats:
+        """Velocity of the IMU's point at the newest epoch, body axes, shape (3,), m/s."""
+        epochs_ns = self._odometry.epochs(EARLIEST_NS, until_ns)
+        if not len(epochs_ns):
+            return np.full(3, np.nan)
+        velocity, _ = self._odometry.velocity_at_imu(int(epochs_ns[-1]))
+        return velocity

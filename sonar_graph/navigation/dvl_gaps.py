@@ -5,18 +5,24 @@ the stamp of the row before the gap, with everything in frame i: the velocity of
 accelerometers gain, is a straight line, whose slope is gravity. Doppler samples z_k at t_k measure points of it, and
 weights w_k of their sum T give its integral over the gap. With W(t) the sum of the weights up to t::
 
-    s = sum_k w_k R_k z_k + sum dt (W(t) - max(t, 0)) R f
+    s = sum_k w_k R_k z_k + sum dt a R f,    a(t) = W(t) - max(t, 0)                                 (1)
 
 Closed: the sample that ends the gap is known. The line joins both ends, ``w = T / 2`` each.
 
 Open: nothing stamped later is known. The line is fitted by least squares to the n samples of the last `WINDOW_NS`
 before the epoch: ``w_k = T (1 / n + (T / 2 - mean t) (t_k - mean t) / sum (t - mean t)^2)``.
 
+Errors. With x(t) minus what s gains after t, an error theta of the gyros (in frame i) and an error n of the
+accelerometers at t change s by ``[x]x theta + a R n``. White noise and constant biases give sums again::
+
+    cov(s) = n_g^2 sum dt [x]x [x]x^T + n_a^2 sum dt a^2 I,    cov(s, theta) = n_g^2 sum dt [x]x     (2)
+    D_gyro = -sum dt [x]x R,    D_accel = -sum dt a R                                                (3)
+
 Walk: where a specific force was not measured, or too little precedes the epoch, the velocity is a random walk of root
 density q (m/s/√s) between its ends, ``q^2 T^3 / 12`` (closed), or from its last value on, ``q^2 T^3 / 3`` (open). An
 open gap is a walk too once the accelerometers are less sure than that (`longest_open_s`).
 
-docs/theory/gaps.md.
+docs/theory/gaps.md has the derivation and the same equation numbers.
 """
 
 from __future__ import annotations
@@ -28,219 +34,297 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
-from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import NS_PER_S, Floats, Ints
 from sonar_graph.motion import PreintegratedMotion
-from sonar_graph.navigation.inertial import Line, hat, spread, sums_along
-from sonar_graph.navigation.samples import LATEST_NS, WINDOW_NS, longest_interval_ns
-from sonar_graph.navigation.steps import Rows
-from sonar_graph.navigation.sums import START, motions_over
+from sonar_graph.navigation.imu_gaps import UNFELT_NS, hole_ns
+from sonar_graph.navigation.preintegration import (
+    NOWHERE,
+    Removed,
+    Rows,
+    Sensors,
+    motion_over,
+    row_of,
+    rows_until,
+    value_at,
+)
+from sonar_graph.navigation.samples import WINDOW_NS
+from sonar_graph.numerics import O3, ZERO, Mat3, Vec3, compiled, cross, exp_and_mean, mat, outer, skew, store, vec
 
-FEWEST, SHORTEST_S = 4, 1.0
-"""Fewest samples of a line, and the shortest time that they span."""
-ZERO = np.zeros(3)
-LATEST = np.array([LATEST_NS])
-
-
-class Sensors(NamedTuple):
-    """Noise and places of the sensors."""
-
-    longest_ns: int
-    """Longest interval between Doppler samples that is no gap."""
-    gyro_density: float
-    accel_density: float
-    accel_bias_sigma: float
-    velocity_walk_density: float
-    longest_open_s: float
-    """Time since bottom lock after which the last velocity is worth more than accelerometers."""
-    body_p_imu: Floats
-    body_p_dvl: Floats
-
-    @classmethod
-    def of(cls, calibration: Calibration) -> Sensors:
-        """Pick the numbers from a calibration."""
-        imu, dvl = calibration.imu, calibration.dvl
-        noise = imu.gyro_noise_density, imu.accel_noise_density, imu.accel_bias_sigma, dvl.velocity_walk_density
-        places = np.array(imu.mounting.translation_m), np.array(dvl.mounting.translation_m)
-        return cls(longest_interval_ns(calibration), *noise, longest_open_s(calibration), *places)
+FEWEST = 4
+"""Fewest samples of a line."""
+SHORTEST_S = 1.0
+"""Shortest time that they span."""
 
 
-def longest_open_s(calibration: Calibration) -> float:
+def longest_open_s(sensors: Sensors) -> float:
     """Time T after which an open gap's horizontal error by accelerometers exceeds that of the walk.
 
     ``n_a^2 T^3 / 3 + g^2 n_g^2 T^5 / 20 + b^2 T^4 / 4 = q^2 T^3 / 3``, of a vehicle that has turned since the slope of
     the line was measured, so that the accelerometer bias b counts in full; infinite for sensors without errors.
     """
-    imu, q = calibration.imu, calibration.dvl.velocity_walk_density
-    tilting, turned = (calibration.gravity_m_s2 * imu.gyro_noise_density) ** 2 / 20.0, imu.accel_bias_sigma**2 / 4.0
-    more = max(q**2 - imu.accel_noise_density**2, 0.0) / 3.0
+    tilting = (sensors.gravity_m_s2 * sensors.gyro_density) ** 2 / 20.0
+    turned = sensors.accel_bias_sigma**2 / 4.0
+    more = max(sensors.velocity_walk_density**2 - sensors.accel_density**2, 0.0) / 3.0
     root = turned + math.sqrt(turned**2 + 4.0 * tilting * more)
     return 2.0 * more / root if root > 0.0 else math.inf
 
 
-class Stretch(NamedTuple):
-    """Sums of the steps from one instant to another, as in `sonar_graph.navigation.sums`, to be continued."""
+def closed_bridge(rows: Rows, sensors: Sensors, removed: Removed, start_ns: int, end_ns: int) -> PreintegratedMotion:
+    """Motion over a gap from an epoch to the next one."""
+    k = int(rows.dvl_ns.searchsorted(start_ns))
+    T = (end_ns - start_ns) * 1e-9
+    # Each end also ends or begins a neighbouring interval, of length d, and errors add up:
+    # ((T + d) / 2)^2 = (T / 2)^2 (1 + 2 d / T) + (d / 2)^2, the last term is the neighbour's own. The interval
+    # after the gap is not known yet and taken as long as the one before. Of two successive gaps the later one
+    # counts what they share.
+    before_s = (rows.dvl_ns[k] - rows.dvl_ns[k - 1]) * 1e-9 if k > 0 else 0.0
+    after_s = before_s if before_s * 1e9 <= sensors.longest_ns else 0.0
+    squares_s2 = 0.25 * T * (T + 2.0 * np.array([before_s, after_s]))
+    ends = LineFit(np.array([k, k + 1]), np.full(2, 0.5 * T), squares_s2)
+    motion = _by_accelerometers(rows, sensors, removed, ends, end_ns)
+    if motion is not None:
+        return motion
+    doppler_psd = np.tensordot(squares_s2 / T, rows.cov[k : k + 2], 1)
+    return _walk(rows, sensors, removed, start_ns, end_ns, doppler_psd)
 
-    start_ns: int
-    until_ns: int
-    sums: Floats = START
 
-
-def motion_over(
-    rows: Rows, sensors: Sensors, start_ns: int, end_ns: int, bias: Floats, earth: Floats = ZERO
+def open_bridge(
+    rows: Rows, sensors: Sensors, removed: Removed, start_ns: int, end_ns: int, whole_end_ns: int
 ) -> PreintegratedMotion:
-    """Motion by linear or held velocities of all rows, however far apart the samples are."""
-    return continued(Stretch(start_ns, start_ns), rows, sensors, end_ns, bias, earth)[1]
+    """Motion from an epoch to an instant in the gap after it, by rows that are known at that instant.
 
-
-def continued(
-    so_far: Stretch, rows: Rows, sensors: Sensors, end_ns: int, bias: Floats, earth: Floats
-) -> tuple[Stretch, PreintegratedMotion]:
-    """Sums continued to an instant, and the motion from their start; the Earth's rotation in the frame there."""
-    from_, until, sums = np.array([so_far.until_ns]), np.array([end_ns]), so_far.sums.copy()
-    noise = bias, earth, sensors.body_p_dvl, sensors.gyro_density
-    dR, dp, C, D, impulse = motions_over(rows, from_, until, LATEST, LATEST_NS, *noise, sums)
-    duration_s = (end_ns - so_far.start_ns) * 1e-9
-    mean_force = impulse[0] / duration_s if duration_s > 0 else np.full(3, np.nan)
-    motion = PreintegratedMotion(gtsam.Pose3(gtsam.Rot3(dR[0]), dp[0]), C[0], D[0], bias, duration_s, mean_force)
-    return Stretch(so_far.start_ns, end_ns, sums), motion
-
-
-def bridge(
-    rows: Rows,
-    sensors: Sensors,
-    start_ns: int,
-    end_ns: int,
-    is_closed: bool,
-    bias: Floats,
-    earth: Floats = ZERO,
-    asked_ns: int | None = None,
-) -> PreintegratedMotion:
-    """Motion over a gap from an epoch to the next one (closed), or to an instant before it (open).
-
-    Used are rows known at the end, of a closed gap until an inertial row covers it. Removed are the gyro bias (body
-    axes) and the Earth's rotation (frame i), rad/s. ``asked_ns``: end of the whole of which this is the first part,
-    which decides whether it is a walk.
+    ``whole_end_ns``: end of the whole motion that this is a part of; its length decides whether the velocity walks.
     """
-    rows = rows if is_closed else rows.known(end_ns)
-    dvl_ns, T = rows.dvl_ns, (end_ns - start_ns) * 1e-9
-    k = int(np.searchsorted(dvl_ns, start_ns))
-    if not is_closed and (dvl_ns[k + 1 : k + 2] - start_ns <= sensors.longest_ns).any():
+    k = int(rows.dvl_ns.searchsorted(start_ns))
+    rows = rows.known(max(end_ns, int(rows.known_ns[k])))  # the epoch may be known later than the instant
+    dvl_ns = rows.dvl_ns
+    T = (end_ns - start_ns) * 1e-9
+    if (dvl_ns[k + 1 : k + 2] - start_ns <= sensors.longest_ns).any():
         # Velocities go on, inertial rows are missing: by velocities as far as they go.
-        last_ns = int(dvl_ns[-1])
-        sampled = motion_over(rows, sensors, start_ns, last_ns, bias, earth)
+        last_ns = min(int(dvl_ns[-1]), end_ns)
+        sampled = motion_over(rows, sensors, removed, start_ns, last_ns)
         if last_ns == end_ns:
             return sampled
-        return sampled.then(_walk(rows, sensors, last_ns, end_ns, bias, sampled.i_T_j.rotation().unrotate(earth)))
-    if is_closed:
-        before_s = (dvl_ns[k] - dvl_ns[k - 1]) * 1e-9 if k > 0 else 0.0
-        after_s = before_s if before_s * 1e9 <= sensors.longest_ns else 0.0
-        # Each end also ends or begins a neighbouring interval, of length d, and errors add up:
-        # ((T + d) / 2)^2 = (T / 2)^2 (1 + 2 d / T) + (d / 2)^2, of which the last is the neighbour's own. The interval
-        # after the gap is not known yet and taken as long as the one before. Of two successive gaps the later one
-        # counts what they share.
-        squares_s2 = 0.25 * T * (T + 2.0 * np.array([before_s, after_s]))
-        motion = _inertial(rows, sensors, np.array([k, k + 1]), np.full(2, 0.5 * T), squares_s2, end_ns, bias, earth)
-        if np.isfinite(motion.i_T_j.translation()).all():
-            return motion
-        doppler_psd = np.tensordot(squares_s2 / T, rows.cov[k : k + 2], 1)
-        return _walk(rows, sensors, start_ns, end_ns, bias, earth, doppler_psd)
-    if ((asked_ns or end_ns) - start_ns) * 1e-9 > sensors.longest_open_s:
-        return _walk(rows, sensors, start_ns, end_ns, bias, earth)
-    samples = np.arange(np.searchsorted(dvl_ns, max(start_ns - WINDOW_NS, rows.imu_ns[0])), k + 1)
+        return sampled.then(_walk(rows, sensors, removed.after(sampled), last_ns, end_ns))
+    if (whole_end_ns - start_ns) * 1e-9 > longest_open_s(sensors):
+        return _walk(rows, sensors, removed, start_ns, end_ns)
+    first = int(dvl_ns.searchsorted(max(start_ns - WINDOW_NS, rows.imu_ns[0])))
+    samples = np.arange(first, k + 1)
     t = (dvl_ns[samples] - start_ns) * 1e-9
     if len(t) >= FEWEST and -t[0] >= SHORTEST_S:
         off = t - t.mean()
-        weights_s = T * (1.0 / len(t) + (0.5 * T - t.mean()) * off / (off @ off))
-        motion = _inertial(rows, sensors, samples, weights_s, weights_s**2, end_ns, bias, earth)
-        if np.isfinite(motion.i_T_j.translation()).all():
+        slope = (0.5 * T - t.mean()) * off / (off @ off)
+        weights_s = T * (1.0 / len(t) + slope)
+        motion = _by_accelerometers(rows, sensors, removed, LineFit(samples, weights_s, weights_s**2), end_ns)
+        if motion is not None:
             return motion
-    return _walk(rows, sensors, start_ns, end_ns, bias, earth)
+    return _walk(rows, sensors, removed, start_ns, end_ns)
 
 
-def _inertial(
-    rows: Rows,
-    sensors: Sensors,
-    samples: Ints,
-    weights_s: Floats,
-    squares_s2: Floats,
-    end_ns: int,
-    bias: Floats,
-    earth: Floats,
-) -> PreintegratedMotion:
-    """Motion by s of the module's equation; NaN where a specific force was not measured.
+class LineFit(NamedTuple):
+    """Doppler samples that level and tilt the line of the velocity."""
 
-    Parameters
-    ----------
-    samples
-        Doppler rows of the line: those until the epoch, or that at the epoch and that at the end.
-    weights_s, squares_s2
-        w_k, shape (n,), and by how much their noise counts, w_k² or more.
-    """
-    cuts_ns, jumps = rows.dvl_ns[samples], np.zeros((len(samples) + 1, 3))
-    is_closed = cuts_ns[-1] == end_ns
-    start_ns, imu_ns = int(cuts_ns[0 if is_closed else -1]), rows.imu_ns
-    imu_rows = int(np.searchsorted(imu_ns, end_ns)) + 1 if is_closed else len(imu_ns)
-    arm, turn = sensors.body_p_dvl - sensors.body_p_imu, np.eye(3)
-    # The turn since the first sample, from which the Earth's rate, known at the epoch, is removed.
-    for _ in range(0 if is_closed else 1 + 2 * bool(earth.any())):
-        window = motion_over(rows, sensors, int(cuts_ns[0]), start_ns, bias, turn @ earth)
-        turn = window.i_T_j.rotation().matrix()
-    rate = np.column_stack([np.interp(cuts_ns, imu_ns[:imu_rows], column[:imu_rows]) for column in rows.rate.T])
-    jumps[:-1] = weights_s[:, None] * (rows.velocity[samples] - np.cross(rate - bias, arm))
-    still = np.zeros((len(samples), 3))
+    samples: Ints
+    """Their rows: those until the epoch (open), or that at the epoch and that at the end (closed), shape (n,)."""
+    weights_s: Floats
+    """w_k, shape (n,)."""
+    squares_s2: Floats
+    """Factor of their noise in the variance of s, w_k² or more, shape (n,)."""
+
+
+def _by_accelerometers(
+    rows: Rows, sensors: Sensors, removed: Removed, fit: LineFit, end_ns: int
+) -> PreintegratedMotion | None:
+    """Motion by (1); None where a specific force was not measured."""
+    cuts_ns = rows.dvl_ns[fit.samples]
+    is_closed = bool(cuts_ns[-1] == end_ns)
+    weights_s = fit.weights_s
+    lever = sensors.body_p_dvl - sensors.body_p_imu
+    # (n, 3), the same numbers however many rows come before and after
+    rate = np.column_stack([np.interp(cuts_ns, rows.imu_ns, column) for column in rows.rate.T])
+    velocity = rows.velocity[fit.samples] - np.cross(rate - removed.bias, lever)  # of the IMU's point, (n, 3)
+    turned = weights_s[:, None] * velocity
     if is_closed:
-        line = Line(cuts_ns, True, weights_s[:1], jumps[:2], still[:1], still[:1], start_ns)
+        start_ns = int(cuts_ns[0])
+        imu_rows = int(rows.imu_ns.searchsorted(end_ns)) + 1
+        line = Line(cuts_ns, weights_s[:1], turned, start_ns, np.eye(3))
     else:
-        line = Line(np.append(cuts_ns, end_ns), True, np.cumsum(weights_s), jumps, still, still, start_ns)
-    sums = sums_along(rows, imu_rows, line, np.ascontiguousarray(turn.T), bias, earth)
-    R, T = sums.R[-1], (end_ns - start_ns) * 1e-9
-    v, _, s = sums.whole.reshape(3, 3)
-    at_samples = sums.R[: len(samples)]
-    swung_s = np.tensordot(weights_s, at_samples, 1)
-    s, swung = s + np.cross(earth, swung_s @ arm), R @ sensors.body_p_imu
-    errors = spread(sums, np.concatenate([v, v, s - swung]), T, sensors.gyro_density, sensors.accel_density)
-    C, D, C_theta, D_accel = np.empty((6, 6)), np.empty((6, 3)), errors.C_theta[6:], errors.D_accel[6:]
-    C[:3, :3], C[3:, :3], C[:3, 3:] = sensors.gyro_density**2 * T * np.eye(3), C_theta, C_theta.T
-    C[3:, 3:] = errors.C[6:, 6:] + sensors.accel_bias_sigma**2 * D_accel @ D_accel.T
-    C[3:, 3:] += np.tensordot(squares_s2, at_samples @ rows.cov[samples] @ at_samples.transpose(0, 2, 1), 1)
-    D[:3], D[3:] = -sums.R_after, errors.D_gyro[6:] - swung_s @ hat(arm)
+        start_ns = int(cuts_ns[-1])
+        imu_rows = len(rows.imu_ns)
+        turn = _turn_until(rows, sensors, removed, int(cuts_ns[0]), start_ns)
+        jumps = np.vstack([turned, np.zeros(3)])
+        i_R_first = np.ascontiguousarray(turn.T)
+        line = Line(np.append(cuts_ns, end_ns), np.cumsum(weights_s), jumps, start_ns, i_R_first)
+    sums = sum_along(rows, imu_rows, line, removed)
+    if not math.isfinite(sum(sums.s)):
+        return None
+
+    T = (end_ns - start_ns) * 1e-9
+    n_g2 = sensors.gyro_density**2
+    R = sums.R[-1]  # i_R_j
+    R_k = sums.R[: len(cuts_ns)]  # (n, 3, 3)
+    swung_s = np.tensordot(weights_s, R_k, 1)
+    # the Earth's rate turns the log about the IMU as well
+    s = np.array(sums.s) + np.cross(removed.earth, swung_s @ lever)
+    way = s - R @ sensors.body_p_imu  # of the body's origin, but for the constant l of the IMU
+
+    # x = y - way after the epoch, y before it
+    y = np.array(sums.y)
+    mixed = np.outer(way, y)
+    xx = np.array(sums.yy) - mixed - mixed.T + T * np.outer(way, way)  # (3, 3)
+    R_after = np.array(sums.R_after)
+    xR = np.array(sums.yR) - gtsam.SO3.Hat(way) @ R_after  # (3, 3)
+    D_accel = -np.array(sums.aR)
+    cov_s_theta = n_g2 * gtsam.SO3.Hat(y - T * way)
+    # (2): [x]x [x]x^T = |x|^2 I - x x^T
+    cov_s = n_g2 * (np.trace(xx) * np.eye(3) - xx.T)
+    cov_s += sensors.accel_density**2 * sums.aa * np.eye(3)
+    cov_s += sensors.accel_bias_sigma**2 * D_accel @ D_accel.T
+    of_samples = R_k @ rows.cov[fit.samples] @ R_k.transpose(0, 2, 1)  # (n, 3, 3)
+    cov_s += np.tensordot(fit.squares_s2, of_samples, 1)
+    C_i = np.block([[n_g2 * T * np.eye(3), cov_s_theta.T], [cov_s_theta, cov_s]])
+    # (3); the gyro bias also turns the samples about the IMU's point
+    D_i = np.vstack([-R_after, -xR - swung_s @ gtsam.SO3.Hat(lever)])
     to_j = np.kron(np.eye(2), R.T)
-    C = to_j @ C @ to_j.T
-    i_T_j = gtsam.Pose3(gtsam.Rot3(R), s - swung + sensors.body_p_imu)
-    return PreintegratedMotion(i_T_j, 0.5 * (C + C.T), to_j @ D, bias, T, v / T)
+    C = to_j @ C_i @ to_j.T
+    i_T_j = gtsam.Pose3(gtsam.Rot3(R), way + sensors.body_p_imu)
+    mean_force = np.array(sums.v) / T
+    return PreintegratedMotion(i_T_j, 0.5 * (C + C.T), to_j @ D_i, removed.bias, T, mean_force)
+
+
+def _turn_until(rows: Rows, sensors: Sensors, removed: Removed, first_ns: int, epoch_ns: int) -> Floats:
+    """Rotation from an earlier instant to the epoch, in whose frame the Earth's rotation is known, shape (3, 3)."""
+    turn = np.eye(3)
+    # the Earth's rate in the earlier frame depends on the turn: twice more is exact to rounding
+    for _ in range(3 if removed.earth.any() else 1):
+        earlier = Removed(removed.bias, turn @ removed.earth)
+        turn = motion_over(rows, sensors, earlier, first_ns, epoch_ns).i_T_j.rotation().matrix()
+    return turn
+
+
+class Line(NamedTuple):
+    """Line of the velocity, from the first of its Doppler samples to the end of the motion."""
+
+    cuts_ns: Ints
+    """Stamps of the samples and the end, shape (m + 1,)."""
+    W: Floats
+    """Sum of the samples' weights in each interval between cuts, shape (m,), s."""
+    jumps: Floats
+    """``w_k z_k`` at the cuts, body axes, shape (m + 1, 3), m."""
+    origin_ns: int
+    """Instant of frame i, one of the cuts; what lies before only shapes s."""
+    R_0: Floats
+    """Rotation from the first cut to frame i, shape (3, 3)."""
+
+
+class LineSums(NamedTuple):
+    """Sums along a line in frame i; y is s so far, in the middle of each step."""
+
+    R: Floats
+    """At the cuts, shape (m + 1, 3, 3)."""
+    v: Vec3
+    """``sum dt R f`` after the origin, m/s."""
+    s: Vec3
+    """Of (1), m."""
+    y: Vec3
+    """``sum dt y`` after the origin."""
+    yy: Mat3
+    """``sum dt y y^T``."""
+    yR: Mat3
+    """``sum dt [y]x R``."""
+    R_after: Mat3
+    """``sum dt R`` after the origin."""
+    aa: float
+    """``sum dt a^2``."""
+    aR: Mat3
+    """``sum dt a R``."""
+
+
+@compiled
+def sum_along(rows: Rows, imu_rows: int, line: Line, removed: Removed) -> LineSums:
+    """Sums along a line from the first ``imu_rows`` inertial rows, linear between them."""
+    imu_ns = rows.imu_ns
+    cuts_ns = line.cuts_ns
+    m = len(line.W)
+    R_cuts = np.empty((m + 1, 3, 3))
+    b = vec(removed.bias)
+    E = vec(removed.earth)
+    R = mat(line.R_0)
+    v = ZERO
+    s = ZERO
+    y = ZERO
+    yy = O3
+    yR = O3
+    R_after = O3
+    aa = 0.0
+    aR = O3
+    t = cuts_ns[0]
+    i = rows_until(imu_ns, t)
+    for k in range(m):
+        store(R, R_cuts[k])
+        s += R @ row_of(line.jumps, k)
+        while t < cuts_ns[k + 1]:
+            until = min(cuts_ns[k + 1], imu_ns[i]) if i < imu_rows else cuts_ns[k + 1]
+            middle = t + (until - t) // 2
+            dt = (until - t) * 1e-9
+            w_k = value_at(imu_ns, rows.rate, imu_rows, i, middle, False) - b - R.T @ E
+            f = value_at(imu_ns, rows.force, imu_rows, i, middle, False)
+            if rows.turns.is_modelled and hole_ns(imu_ns, imu_rows, i, until) > UNFELT_NS:
+                f = NOWHERE
+            turn, mean = exp_and_mean(dt * w_k)
+            R_k = R @ mean
+            # before the origin a step turns the samples of the window, not the motion
+            after = 1.0 if middle > line.origin_ns else 0.0
+            a = line.W[k] - after * ((middle - line.origin_ns) * 1e-9)
+            F = dt * (R_k @ f)
+            # second order in a step: the force turns while its share a falls
+            ds = a * F - (after * dt**3 / 12.0) * (R_k @ cross(w_k, f))
+            y_k = s + 0.5 * ds + (after * dt / 12.0) * F
+            v += after * F
+            y += (after * dt) * y_k
+            yy += outer(dt * y_k, y_k)
+            yR += dt * (skew(y_k) @ R_k)
+            R_after += (after * dt) * R_k
+            aa += dt * a * a
+            aR += (dt * a) * R_k
+            s += ds
+            R = R @ turn
+            i += int(i < imu_rows and imu_ns[i] <= until)
+            t = until
+    store(R, R_cuts[m])
+    s += R @ row_of(line.jumps, m)
+    return LineSums(R_cuts, v, s, y, yy, yR, R_after, aa, aR)
 
 
 def _walk(
-    rows: Rows,
-    sensors: Sensors,
-    start_ns: int,
-    end_ns: int,
-    bias: Floats,
-    earth: Floats,
-    doppler_psd: Floats | None = None,
+    rows: Rows, sensors: Sensors, removed: Removed, start_ns: int, end_ns: int, doppler_psd: Floats | None = None
 ) -> PreintegratedMotion:
     """Motion with a velocity that walks between both ends, or (without a density of their noise) after the last sample.
 
     It is that of a Doppler log of two rows whose noise between them, or after them, has the density wanted.
     """
-    k, T = int(np.searchsorted(rows.dvl_ns, start_ns)), (end_ns - start_ns) * 1e-9
+    k = int(rows.dvl_ns.searchsorted(start_ns))
+    T = (end_ns - start_ns) * 1e-9
+    # a walk is white noise of the velocity, integrated: variance q^2 T^3 / 12 or / 3 of the displacement
     walked = (sensors.velocity_walk_density * T) ** 2 * np.eye(3)
     if doppler_psd is None:
-        dvl_ns, velocity = np.array([start_ns - NS_PER_S, start_ns]), rows.velocity[[k, k]]
+        dvl_ns = np.array([start_ns - NS_PER_S, start_ns])
+        velocity = rows.velocity[[k, k]]
         cov = T * rows.cov[k] + walked / 3.0
     else:
-        dvl_ns, velocity = np.array([start_ns, end_ns]), rows.velocity[k : k + 2]
+        dvl_ns = np.array([start_ns, end_ns])
+        velocity = rows.velocity[k : k + 2]
         cov = (doppler_psd + walked / 12.0) / T
     log = rows._replace(dvl_ns=dvl_ns, velocity=velocity, cov=np.array([cov, cov]), known_ns=dvl_ns)
-    return motion_over(log, sensors, start_ns, end_ns, bias, earth)
+    return motion_over(log, sensors, removed, start_ns, end_ns)
 
 
 def remaining_motion(before: PreintegratedMotion, whole: PreintegratedMotion) -> PreintegratedMotion:
     """The rest of a whole motion after a first part of it, with the growth of its error."""
     motion = before.i_T_j.between(whole.i_T_j)
-    adjoint = motion.inverse().AdjointMap()
-    grown = whole.covariance - adjoint @ before.covariance @ adjoint.T
+    A = motion.inverse().AdjointMap()
+    # growth of the error; rounding may leave an eigenvalue below zero
+    grown = whole.covariance - A @ before.covariance @ A.T
     variances, axes = np.linalg.eigh(0.5 * (grown + grown.T))
     duration_s = whole.duration_s - before.duration_s
     impulse = whole.mean_specific_force * whole.duration_s
@@ -250,7 +334,7 @@ def remaining_motion(before: PreintegratedMotion, whole: PreintegratedMotion) ->
         whole,
         i_T_j=motion,
         covariance=(axes * np.maximum(variances, 0.0)) @ axes.T,
-        D_bias=whole.D_bias - adjoint @ before.D_bias,
+        D_bias=whole.D_bias - A @ before.D_bias,
         duration_s=duration_s,
         mean_specific_force=before.i_T_j.rotation().unrotate(impulse / duration_s),
     )

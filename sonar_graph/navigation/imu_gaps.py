@@ -11,7 +11,7 @@ the length T errs by the variance::
 
 The rows beside a hole stand for all of it, and so does their noise: of density n at intervals of dt it adds
 ``n^2 T^2 / (2 dt)`` to a closed hole and ``n^2 T^2 / dt`` to an open one. Over a closed hole all this is spread evenly
-as white noise; an open one gets the growth since its last row. Errors about the three axes are independent.
+as white noise; a step in an open one gets what has grown meanwhile. Errors about the three axes are independent.
 
 Derivation and what is left out: docs/theory/gaps.md.
 """
@@ -22,19 +22,19 @@ import numpy as np
 
 from sonar_graph.calibration import HOLE_INTERVALS, ROWS_BEFORE, SHORTEST_HOLE_S, UNTYPICAL_S, ImuCalibration
 from sonar_graph.measurements import Floats, Ints
-from sonar_graph.numerics import Vec3, compiled, vec
+from sonar_graph.numerics import Vec3, compiled
 
 UNTYPICAL_NS = round(UNTYPICAL_S * 1e9)
+SHORTEST_NS = round(SHORTEST_HOLE_S * 1e9)
 UNFELT_NS = 100_000_000
 """Specific force counts as not measured in longer holes: in shorter ones a vehicle turns by less than 1e-4 rad
-unseen."""
-SHORTEST_NS = round(SHORTEST_HOLE_S * 1e9)
+unmeasured."""
 SHORT = 0.03
 """T / c below which two terms of a series are exact to 1e-3 and differences of large numbers are not."""
 
 
 class Turns(NamedTuple):
-    """Model of the turns of a vehicle unseen in holes of its IMU."""
+    """Model of the turns of a vehicle in holes of its IMU."""
 
     is_modelled: bool
     sigma: Floats
@@ -47,32 +47,34 @@ class Turns(NamedTuple):
 
 def turns_of(imu: ImuCalibration) -> Turns:
     """The numbers of a calibration."""
-    is_modelled = any(sigma > 0 for sigma in imu.turn_sigma_rad_s)
-    return Turns(is_modelled, np.array(imu.turn_sigma_rad_s), np.array(imu.turn_time_s), imu.gyro_noise_density)
+    sigma = np.array(imu.turn_sigma_rad_s)
+    return Turns(bool((sigma > 0).any()), sigma, np.array(imu.turn_time_s), imu.gyro_noise_density)
 
 
-ONES = Vec3(1.0, 1.0, 1.0)
 UNTURNED = Turns(False, np.ones(3), np.ones(3), 0.0)
 """With it no interval is a hole."""
 
 
 @compiled
 def typical_ns(stamps: Ints, row: int) -> int:
-    """Median of the `ROWS_BEFORE` intervals before a row, of an even number the shorter; 0 where there is none."""
+    """Median of the `ROWS_BEFORE` intervals before a row, of an even number the shorter; 0 without intervals."""
     first = max(row - ROWS_BEFORE, 0)
     for k in range(first, row):
-        shorter = same = 0
+        interval = stamps[k + 1] - stamps[k]
+        shorter = 0
+        same = 0
         for m in range(first, row):
-            shorter += int(stamps[m + 1] - stamps[m] < stamps[k + 1] - stamps[k])
-            same += int(stamps[m + 1] - stamps[m] == stamps[k + 1] - stamps[k])
+            other = stamps[m + 1] - stamps[m]
+            shorter += int(other < interval)
+            same += int(other == interval)
         if 2 * shorter < row - first <= 2 * (shorter + same):
-            return stamps[k + 1] - stamps[k]
+            return interval
     return 0
 
 
 @compiled
 def hole_ns(stamps: Ints, rows: int, row: int, until_ns: int) -> int:
-    """Length of the hole before a row; 0 where there is none.
+    """Length of the hole before a row; 0 without a hole.
 
     Only the first ``rows`` stamps are known; ``row = rows`` means a hole that is open, and lasts until ``until_ns`` so
     far.
@@ -83,13 +85,16 @@ def hole_ns(stamps: Ints, rows: int, row: int, until_ns: int) -> int:
     length_ns = (stamps[row] if row < rows else until_ns) - stamps[last]
     if length_ns <= SHORTEST_NS:
         return 0
+    # rows may be lost or jitter: only intervals far longer than usual are holes
     typical = typical_ns(stamps, last)
-    return length_ns if length_ns > (HOLE_INTERVALS * typical if typical > 0 else UNTYPICAL_NS) else 0
+    longest_ns = HOLE_INTERVALS * typical if typical > 0 else UNTYPICAL_NS
+    return length_ns if length_ns > longest_ns else 0
 
 
 def row_after_hole(stamps: Ints, first: int, last: int, longest_ns: int) -> int:
-    """The row after the first hole between two rows that lasts longer; -1 where there is none."""
-    for row in (first + 1 + np.flatnonzero(np.diff(stamps[first : last + 1]) > longest_ns)).tolist():
+    """The row after the first hole between two rows that lasts longer; -1 without one."""
+    intervals = np.diff(stamps[first : last + 1])
+    for row in (first + 1 + np.flatnonzero(intervals > longest_ns)).tolist():
         if hole_ns(stamps, len(stamps), row, stamps[row]) > 0:
             return int(row)
     return -1
@@ -98,20 +103,26 @@ def row_after_hole(stamps: Ints, first: int, last: int, longest_ns: int) -> int:
 @compiled
 def error_in_hole(turns: Turns, stamps: Ints, rows: int, row: int, t: int, until_ns: int) -> Vec3:
     """Spectral density of the rates' error: the mean over a closed hole, the growth of an open one since t; rad²/s."""
-    last, n2 = min(row, rows) - 1, turns.gyro_density**2
+    last = min(row, rows) - 1
     typical_s = typical_ns(stamps, last) * 1e-9
-    by_row = n2 / typical_s if typical_s > 0.0 else 0.0
-    s, c = vec(turns.sigma), vec(turns.time_s)
+    by_row = turns.gyro_density**2 / typical_s if typical_s > 0.0 else 0.0  # n^2 / dt
     if row < rows:
         T = (stamps[row] - stamps[last]) * 1e-9
-        grown = Vec3(closed_variance(s.x, c.x, T), closed_variance(s.y, c.y, T), closed_variance(s.z, c.z, T))
-        return (1.0 / T) * grown + 0.5 * by_row * T * ONES
-    T, before_s = (until_ns - stamps[last]) * 1e-9, (t - stamps[last]) * 1e-9
-    grown = Vec3(open_variance(s.x, c.x, T), open_variance(s.y, c.y, T), open_variance(s.z, c.z, T))
-    grown -= Vec3(
-        open_variance(s.x, c.x, before_s), open_variance(s.y, c.y, before_s), open_variance(s.z, c.z, before_s)
+        noise = 0.5 * by_row * T
+        return Vec3(
+            closed_variance(turns.sigma[0], turns.time_s[0], T) / T + noise,
+            closed_variance(turns.sigma[1], turns.time_s[1], T) / T + noise,
+            closed_variance(turns.sigma[2], turns.time_s[2], T) / T + noise,
+        )
+    # open: what has grown since t, of a variance that counts from the last row
+    T = (until_ns - stamps[last]) * 1e-9
+    before_s = (t - stamps[last]) * 1e-9
+    noise = by_row * (T + before_s)
+    return Vec3(
+        open_growth(turns.sigma[0], turns.time_s[0], before_s, T) + noise,
+        open_growth(turns.sigma[1], turns.time_s[1], before_s, T) + noise,
+        open_growth(turns.sigma[2], turns.time_s[2], before_s, T) + noise,
     )
-    return (1.0 / (T - before_s)) * grown + by_row * (T + before_s) * ONES
 
 
 @compiled
@@ -132,3 +143,10 @@ def open_variance(sigma: float, time_s: float, length_s: float) -> float:
         return (sigma * time_s) ** 2 * a**4 / 4.0 * (1.0 - 8.0 / 15.0 * a)
     by_end = (6.0 + a * (6.0 + 2.0 * a)) * np.exp(-a)
     return (sigma * time_s) ** 2 * (a * a - 6.0 + by_end)
+
+
+@compiled
+def open_growth(sigma: float, time_s: float, before_s: float, until_s: float) -> float:
+    """Growth of `open_variance` from one length of the hole to another, over the time between them, rad²/s."""
+    grown = open_variance(sigma, time_s, until_s) - open_variance(sigma, time_s, before_s)
+    return grown / (until_s - before_s)

@@ -6,7 +6,7 @@ too few beams) from that of the row that confirms or completes it (`sonar_graph.
 counts as reached at time t when its row is known and an IMU row at or after it is stamped at or before t. What happens
 between epochs (a detection, a depth sample, an estimate) is related to the newest reached epoch by a provisional motion
 that uses nothing known later. Results therefore depend on stamps alone, to the bit, not on how a log is cut into calls
-or what was asked in between, as long as no row comes after another of its sensor that is stamped later.
+or on earlier calls, as long as no row comes after another of its sensor that is stamped later.
 
 Gaps. A gap between two epochs is bridged with both its ends known. In a gap that lasts, both instants are reached from
 the epoch at which bottom lock was lost::
@@ -18,25 +18,41 @@ docs/theory/preintegration.md, docs/theory/gaps.md.
 """
 
 from types import NoneType
+from typing import NamedTuple
 
 import numpy as np
 
 from sonar_graph.calibration import ROWS_BEFORE, Calibration, require_calibration
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Depth, Dvl, Floats, Imu, Ints
-from sonar_graph.motion import Motions, PreintegratedMotion
-from sonar_graph.navigation.alignment import earth_rate_in_world
-from sonar_graph.navigation.dvl_gaps import Sensors, Stretch, bridge, continued, motion_over, remaining_motion
+from sonar_graph.motion import Motions, PreintegratedMotion, earth_rate_in_world
+from sonar_graph.navigation.dvl_gaps import closed_bridge, open_bridge, remaining_motion
 from sonar_graph.navigation.dvl_screening import RowIntake
 from sonar_graph.navigation.imu_gaps import UNTURNED, turns_of
-from sonar_graph.navigation.samples import WINDOW_NS, finite_vector, no_doppler_stamp
-from sonar_graph.navigation.steps import Rows, rows_until
-from sonar_graph.navigation.sums import motions_over
+from sonar_graph.navigation.preintegration import (
+    Intervals,
+    Removed,
+    Rows,
+    Sensors,
+    Stretch,
+    motions_over,
+    rows_until,
+)
+from sonar_graph.navigation.samples import EARLIEST_NS, WINDOW_NS, finite_vector, no_doppler_stamp
 from sonar_graph.numerics import compiled
 from sonar_graph.sequence import PAUSE_NS
 from sonar_graph.states import RefusedRow
 
 ZERO = np.zeros(3)
+
+
+class Kept(NamedTuple):
+    """Part of a motion that is final, kept for the next call with the same start, bias and Earth's rotation."""
+
+    key: tuple[int, bytes, bytes]
+    """Start, bias and Earth's rotation."""
+    stretch: Stretch
+    """From the start, or from the end of the last gap, with the motion before it."""
 
 
 class Odometry:
@@ -55,7 +71,8 @@ class Odometry:
     >>> from sonar_graph.calibration import Calibration
     >>> from sonar_graph.measurements import Dvl, Imu
     >>> from sonar_graph.navigation import Odometry
-    >>> imu_ns, dvl_ns = np.arange(201) * 10_000_000, np.arange(11) * 200_000_000
+    >>> imu_ns = np.arange(201) * 10_000_000
+    >>> dvl_ns = np.arange(11) * 200_000_000
     >>> odometry = Odometry(Calibration())
     >>> odometry.add(
     ...     Imu(imu_ns, np.zeros((201, 3)), np.tile([0.0, 0.0, 9.81], (201, 1))),
@@ -70,16 +87,16 @@ class Odometry:
     def __init__(self, calibration: Calibration) -> None:
         require_calibration(calibration, "Odometry(calibration)")
         self.calibration = calibration
-        """What it was made with."""
+        """Calibration that it was made with."""
         self._intake = RowIntake(calibration)
-        self._imu, self._dvl = self._intake.imu, self._intake.dvl
+        self._imu = self._intake.imu
+        self._dvl = self._intake.dvl
         self._hold_past = calibration.odometry_interpolation == "hold-past"
         self._turns = UNTURNED if self._hold_past else turns_of(calibration.imu)
         self._sensors = Sensors.of(calibration)
-        self._earth = earth_rate_in_world(calibration)
         self._dvl_p_imu = (self._sensors.body_p_imu - self._sensors.body_p_dvl).tolist()
-        self._kept: tuple[tuple[int, bytes, bytes], PreintegratedMotion | None, Stretch] | None = None
-        """Start, bias and Earth's rate of a motion; its part until the last gap's end; the sums since."""
+        self._earth = earth_rate_in_world(calibration)
+        self._kept: Kept | None = None
 
     @property
     def refused(self) -> list[RefusedRow]:
@@ -87,7 +104,7 @@ class Odometry:
         return self._intake.refused
 
     def add(self, imu: Imu | None, dvl: Dvl | None) -> bool:
-        """Take in rows and place them by their stamps.
+        """Add rows and place them by their stamps.
 
         Of rows with equal stamps the first counts. A row that comes after motion up to its stamp was settled is late,
         and a velocity may be an outlier (`sonar_graph.navigation.dvl_screening.dvl_gate`): both go to `refused`.
@@ -121,36 +138,47 @@ class Odometry:
     def forget_before(self, epoch_ns: int) -> None:
         """Settle, and drop rows that no motion from this epoch on can need, gaps after it included."""
         self.settle(epoch_ns)
+        # a gap that opens at the epoch is bridged by a line through the window before it
         needed_ns = epoch_ns if self._hold_past else epoch_ns - WINDOW_NS
         self._imu.forget_before(needed_ns, ROWS_BEFORE)
         self._dvl.forget_before(needed_ns)
 
     def start_by(self, until_ns: int) -> int | None:
         """First epoch, if it is reached at an instant: IMU rows cover it, and its velocity is confirmed; else None."""
-        imu_ns, dvl_ns = self._imu.stamps_ns, self._dvl.stamps_ns
-        first = dvl_ns[np.searchsorted(dvl_ns, imu_ns[0]) :] if len(imu_ns) else dvl_ns[:0]
-        if not len(first) or first[0] > imu_ns[-1]:
+        imu_ns = self._imu.stamps_ns
+        dvl_ns = self._dvl.stamps_ns
+        if not len(imu_ns):
             return None
-        if first[0] - imu_ns[0] > PAUSE_NS:
-            self._intake.refuse_imu_before(int(first[0]) - PAUSE_NS)
+        covered = dvl_ns[np.searchsorted(dvl_ns, imu_ns[0]) :]
+        if not len(covered) or covered[0] > imu_ns[-1]:
+            return None
+        first_ns = int(covered[0])
+        # a clock that was set after the first rows of the IMU
+        if first_ns - imu_ns[0] > PAUSE_NS:
+            self._intake.refuse_imu_before(first_ns - PAUSE_NS)
             return self.start_by(until_ns)
-        return int(first[0]) if self.reached_ns(int(first[0])) <= until_ns else None
+        return first_ns if self.reached_ns(first_ns) <= until_ns else None
 
     def epochs(self, after_ns: int, until_ns: int) -> Ints:
         """Epochs after one instant that are reached at another, in order, shape (n,)."""
-        dvl_ns = self._dvl.stamps_ns
-        first, last = epochs_between(after_ns, until_ns, self._imu.stamps_ns, dvl_ns, self._dvl.values[2])
-        return dvl_ns[first:last]
+        first, last = self._epochs_between(after_ns, until_ns)
+        return self._dvl.stamps_ns[first:last]
 
     def epochs_reached(self, after_ns: int, until_ns: int) -> tuple[Ints, Ints]:
         """`epochs` and their `reached_ns`, shapes (n,)."""
-        dvl_ns, known_ns = self._dvl.stamps_ns, self._dvl.values[2]
-        first, last, reached_ns = _epochs_reached(after_ns, until_ns, self._imu.stamps_ns, dvl_ns, known_ns)
-        return dvl_ns[first:last], reached_ns
+        first, last = self._epochs_between(after_ns, until_ns)
+        imu_ns = self._imu.stamps_ns
+        known_ns = self._dvl.values[2]
+        epochs_ns = self._dvl.stamps_ns[first:last]
+        # stamp of the IMU row that covers each epoch
+        covered_ns = imu_ns[imu_ns.searchsorted(epochs_ns)]
+        return epochs_ns, np.maximum(covered_ns, known_ns[first:last])
 
     def reached_ns(self, epoch_ns: int) -> int:
         """Instant at which an epoch is reached: an IMU row covers it, and its velocity is known."""
-        imu_ns, dvl_ns, known_ns = self._imu.stamps_ns, self._dvl.stamps_ns, self._dvl.values[2]
+        imu_ns = self._imu.stamps_ns
+        dvl_ns = self._dvl.stamps_ns
+        known_ns = self._dvl.values[2]
         return int(max(imu_ns[imu_ns.searchsorted(epoch_ns)], known_ns[dvl_ns.searchsorted(epoch_ns)]))
 
     def is_gap(self, start_ns: int, end_ns: int) -> bool:
@@ -163,7 +191,7 @@ class Odometry:
         """Motion from one instant to another, over gaps too, from rows known at ``known_ns``, by default the second.
 
         To an epoch, name an instant at which it is reached. The part up to the newest epoch is final and kept: the same
-        start and bias, asked for later and later instants, cost what is new.
+        start and bias, with later and later ends, cost what is new.
 
         Raises
         ------
@@ -172,7 +200,70 @@ class Odometry:
             finite vector.
         """
         bias = finite_vector("bias", bias, 3)
-        imu_ns, dvl_ns = self._imu.stamps_ns, self._dvl.stamps_ns
+        self._require_interval(start_ns, end_ns)
+        if known_ns is None:
+            known_ns = end_ns
+        # without an attitude the Earth's rotation in frame i is not known
+        earth = ZERO if self._earth is None or world_R_i is None else world_R_i.T @ self._earth
+        removed = Removed(bias, earth)
+        lost_ns = self._newest_epoch(min(end_ns, known_ns))
+        if lost_ns is not None and lost_ns < start_ns < end_ns and self.is_gap(lost_ns, end_ns):
+            # both instants lie in one open gap
+            before = self._motion_since(lost_ns, start_ns, known_ns, removed, end_ns)
+            whole = self._motion_since(lost_ns, end_ns, known_ns, removed, end_ns)
+            return remaining_motion(before, whole)
+        return self._motion_since(start_ns, end_ns, known_ns, removed, end_ns)
+
+    def motions(self, start_ns: Ints, end_ns: Ints, known_ns: Ints, bias: Floats) -> Motions:
+        """Motions over intervals, each from rows known at its ``known_ns``."""
+        intervals = Intervals(start_ns, end_ns, known_ns, self._sensors.longest_ns)
+        return motions_over(self.rows(), intervals, self._sensors, Removed(bias, ZERO))
+
+    def velocity_at_imu(self, epoch_ns: int) -> tuple[Floats, float]:
+        """Velocity of the IMU's point at an epoch, body axes, shape (3,), m/s, and the variance of one component."""
+        velocity, cov, _ = self._dvl.values
+        dvl_ns = self._dvl.stamps_ns
+        k = int(dvl_ns.searchsorted(epoch_ns))
+        if k == len(dvl_ns) or dvl_ns[k] != epoch_ns:
+            raise no_doppler_stamp("epoch_ns", epoch_ns, dvl_ns)
+        x, y, z = self._rate_at(epoch_ns)
+        a, b, c = self._dvl_p_imu
+        swing = y * c - z * b, z * a - x * c, x * b - y * a  # w x (imu - dvl); np.cross takes ten times as long
+        xx, yy, zz = cov[k].diagonal().tolist()
+        return velocity[k] + swing, (xx + yy + zz) / 3.0
+
+    def _rate_at(self, epoch_ns: int) -> list[float]:
+        """Angular rate at an epoch, body axes, rad/s."""
+        rate = self._imu.values[0]
+        imu_ns = self._imu.stamps_ns
+        i = int(imu_ns.searchsorted(epoch_ns))
+        after: list[float] = rate[min(i, len(rate) - 1)].tolist()
+        if self._hold_past or not 0 < i < len(rate):
+            return after
+        share = float((epoch_ns - imu_ns[i - 1]) / (imu_ns[i] - imu_ns[i - 1]))
+        return [w_0 + share * (w - w_0) for w_0, w in zip(rate[i - 1].tolist(), after, strict=True)]
+
+    def rows(self) -> Rows:
+        """Rows of both sensors that are still needed."""
+        rate, force = self._imu.values
+        velocity, cov, known_ns = self._dvl.values
+        imu_ns = self._imu.stamps_ns
+        dvl_ns = self._dvl.stamps_ns
+        return Rows(imu_ns, rate, force, dvl_ns, velocity, cov, known_ns, self._hold_past, self._turns)
+
+    def _epochs_between(self, after_ns: int, until_ns: int) -> tuple[int, int]:
+        """First and last row (exclusive) of the epochs after one instant that are reached at another."""
+        return _epochs_between(after_ns, until_ns, self._imu.stamps_ns, self._dvl.stamps_ns, self._dvl.values[2])
+
+    def _newest_epoch(self, until_ns: int) -> int | None:
+        """The newest epoch that is reached at an instant; None before the first."""
+        _, last = self._epochs_between(EARLIEST_NS, until_ns)
+        return int(self._dvl.stamps_ns[last - 1]) if last > 0 else None
+
+    def _require_interval(self, start_ns: int, end_ns: int) -> None:
+        """Raise MeasurementError where rows do not begin before an interval, or its end lies before its start."""
+        imu_ns = self._imu.stamps_ns
+        dvl_ns = self._dvl.stamps_ns
         if not (len(imu_ns) and len(dvl_ns)):
             raise MeasurementError("motion: needs rows of IMU and Doppler log; add them first")
         for name, instant in (("start_ns", start_ns), ("end_ns", end_ns)):
@@ -182,111 +273,56 @@ class Odometry:
                 )
         if end_ns < start_ns:
             raise MeasurementError(f"interval: ends at {end_ns} ns, before its start {start_ns}; the earlier first")
-        if start_ns < (first_ns := max(imu_ns[0], dvl_ns[0])):
+        first_ns = max(imu_ns[0], dvl_ns[0])
+        if start_ns < first_ns:
             raise MeasurementError(f"start_ns: {start_ns} lies before the rows; begin at {first_ns} or later")
-        known_ns = end_ns if known_ns is None else known_ns
-        noise = bias, ZERO if self._earth is None or world_R_i is None else world_R_i.T @ self._earth
-        before_ns = self.epochs(dvl_ns[0] - 1, min(end_ns, known_ns))
-        if len(before_ns) and before_ns[-1] < start_ns < end_ns and self.is_gap(int(before_ns[-1]), end_ns):
-            lost_ns = int(before_ns[-1])
-            return remaining_motion(*(self._since(lost_ns, t, known_ns, *noise, end_ns) for t in (start_ns, end_ns)))
-        return self._since(start_ns, end_ns, known_ns, *noise)
 
-    def motions(self, start_ns: Ints, end_ns: Ints, known_ns: Ints, bias: Floats) -> Motions:
-        """Motions over intervals, each from rows known at its ``known_ns``."""
-        sensors = self._sensors
-        noise = bias, ZERO, sensors.body_p_dvl, sensors.gyro_density
-        return motions_over(self.rows(), start_ns, end_ns, known_ns, sensors.longest_ns, *noise)
-
-    def velocity_at_imu(self, epoch_ns: int) -> tuple[Floats, float]:
-        """Velocity of the IMU's point at an epoch, body axes, shape (3,), m/s, and the variance of one component."""
-        (velocity, cov, _), (rates, _) = self._dvl.values, self._imu.values
-        dvl_ns, imu_ns = self._dvl.stamps_ns, self._imu.stamps_ns
-        k, i = int(dvl_ns.searchsorted(epoch_ns)), int(imu_ns.searchsorted(epoch_ns))
-        if k == len(dvl_ns) or dvl_ns[k] != epoch_ns:
-            raise no_doppler_stamp("epoch_ns", epoch_ns, dvl_ns)
-        x, y, z = rates[min(i, len(rates) - 1)].tolist()
-        if 0 < i < len(rates) and not self._hold_past:
-            x_0, y_0, z_0 = rates[i - 1].tolist()
-            share = float((epoch_ns - imu_ns[i - 1]) / (imu_ns[i] - imu_ns[i - 1]))
-            x, y, z = x_0 + share * (x - x_0), y_0 + share * (y - y_0), z_0 + share * (z - z_0)
-        a, b, c = self._dvl_p_imu
-        swing = y * c - z * b, z * a - x * c, x * b - y * a
-        return velocity[k] + swing, float(cov[k, 0, 0] + cov[k, 1, 1] + cov[k, 2, 2]) / 3.0
-
-    def rows(self) -> Rows:
-        """Rows of both sensors that are still needed."""
-        (rate, force), (velocity, cov, known_ns) = self._imu.values, self._dvl.values
-        imu_ns, dvl_ns = self._imu.stamps_ns, self._dvl.stamps_ns
-        return Rows(imu_ns, rate, force, dvl_ns, velocity, cov, known_ns, self._hold_past, self._turns)
-
-    def _since(
-        self, start_ns: int, end_ns: int, known_ns: int, bias: Floats, earth: Floats, asked_ns: int | None = None
+    def _motion_since(
+        self, start_ns: int, end_ns: int, known_ns: int, removed: Removed, whole_end_ns: int
     ) -> PreintegratedMotion:
         """Motion from an instant: final to the newest epoch, provisional from there on.
 
-        Over gaps between epochs it goes by bridges; between gaps it is one sum of steps.
+        Gaps between epochs are bridged; between gaps the motion is one sum of steps. ``whole_end_ns``: as for
+        `open_bridge`.
         """
-        rows, sensors = self.rows().known(known_ns), self._sensors
+        rows = self.rows()
+        sensors = self._sensors
         epochs_ns = self.epochs(start_ns - 1, known_ns)
         epochs_ns = epochs_ns[: epochs_ns.searchsorted(end_ns, side="right")]
         newest_ns = int(epochs_ns[-1]) if len(epochs_ns) else start_ns
-        of, kept = (start_ns, bias.tobytes(), earth.tobytes()), self._kept
-        if kept is None or kept[0] != of or kept[2].until_ns > newest_ns:
-            kept = of, None, Stretch(start_ns, start_ns)
-        _, before, stretch = kept
-        new_ns = epochs_ns[epochs_ns.searchsorted(stretch.until_ns) :]
-        for k in np.flatnonzero(np.diff(new_ns) > sensors.longest_ns).tolist() if len(new_ns) > 1 else ():
-            lost_ns, found_ns = int(new_ns[k]), int(new_ns[k + 1])
-            _, before = self._followed(before, stretch, rows, lost_ns, bias, earth)
-            over = bridge(rows, sensors, lost_ns, found_ns, True, bias, _in_frame(before, earth))
-            before, stretch = _joined(before, over), Stretch(found_ns, found_ns)
-        motion, is_lost = None, len(epochs_ns) > 0 and self.is_gap(newest_ns, end_ns)
-        last_ns = newest_ns if is_lost else end_ns
+        stretch = Stretch.begin(start_ns, removed.bias)
+        key = start_ns, removed.bias.tobytes(), removed.earth.tobytes()
+        kept = self._kept
+        if kept is not None and kept.key == key and kept.stretch.until_ns <= newest_ns:
+            stretch = kept.stretch
+
         if stretch.until_ns < newest_ns:
-            stretch, motion = self._followed(before, stretch, rows, newest_ns, bias, earth)
-        self._kept = of, before, stretch
-        if motion is None or last_ns > newest_ns:
-            _, motion = self._followed(before, stretch, rows, last_ns, bias, earth)
-        if is_lost:
-            earth = _in_frame(motion, earth)
-            return _joined(motion, bridge(rows, sensors, newest_ns, end_ns, False, bias, earth, asked_ns))
-        return motion or motion_over(rows, sensors, start_ns, start_ns, bias, earth)
+            new_ns = epochs_ns[epochs_ns.searchsorted(stretch.until_ns) :]
+            for k in np.flatnonzero(np.diff(new_ns) > sensors.longest_ns).tolist():
+                lost_ns = int(new_ns[k])
+                found_ns = int(new_ns[k + 1])
+                before = stretch.continued(rows, sensors, removed, lost_ns, known_ns).motion
+                over_gap = closed_bridge(rows.known(known_ns), sensors, removed.after(before), lost_ns, found_ns)
+                stretch = Stretch.begin(found_ns, removed.bias, before.then(over_gap))
+            stretch = stretch.continued(rows, sensors, removed, newest_ns, known_ns)
+        self._kept = Kept(key, stretch)
 
-    def _followed(
-        self, before: PreintegratedMotion | None, stretch: Stretch, rows: Rows, end_ns: int, bias: Floats, earth: Floats
-    ) -> tuple[Stretch, PreintegratedMotion | None]:
-        """A stretch continued to an instant, and the motion before, or none, followed by it; none if nothing passed."""
-        if stretch.start_ns == end_ns:
-            return stretch, before
-        stretch, motion = continued(stretch, rows, self._sensors, end_ns, bias, _in_frame(before, earth))
-        return stretch, _joined(before, motion)
-
-
-def _joined(before: PreintegratedMotion | None, motion: PreintegratedMotion) -> PreintegratedMotion:
-    """A motion, or none, followed by another."""
-    return motion if before is None else before.then(motion)
+        # from the newest epoch on: provisional, and not kept
+        if len(epochs_ns) and self.is_gap(newest_ns, end_ns):
+            before = stretch.motion
+            here = removed.after(before)
+            since_lost = open_bridge(rows.known(known_ns), sensors, here, newest_ns, end_ns, whole_end_ns)
+            return before.then(since_lost)
+        return stretch.continued(rows, sensors, removed, end_ns, known_ns).motion
 
 
 @compiled
-def epochs_between(after_ns: int, until_ns: int, imu_ns: Ints, dvl_ns: Ints, known_ns: Ints) -> tuple[int, int]:
+def _epochs_between(after_ns: int, until_ns: int, imu_ns: Ints, dvl_ns: Ints, known_ns: Ints) -> tuple[int, int]:
     """First and last row (exclusive) of `Odometry.epochs`."""
-    seen, first, last = rows_until(imu_ns, until_ns), rows_until(dvl_ns, after_ns), 0
+    # an epoch needs an IMU row at or after it, and a velocity that is known
+    seen = rows_until(imu_ns, until_ns)
+    first = rows_until(dvl_ns, after_ns)
+    last = 0
     if seen > 0:
         last = min(rows_until(known_ns, until_ns), rows_until(dvl_ns, imu_ns[seen - 1]))
     return first, max(first, last)
-
-
-@compiled
-def _epochs_reached(after_ns: int, until_ns: int, imu_ns: Ints, dvl_ns: Ints, known_ns: Ints) -> tuple[int, int, Ints]:
-    """First and last row (exclusive) of `Odometry.epochs`, and when these are reached."""
-    first, last = epochs_between(after_ns, until_ns, imu_ns, dvl_ns, known_ns)
-    reached_ns = np.empty(last - first, np.int64)
-    for k in range(len(reached_ns)):
-        reached_ns[k] = max(imu_ns[rows_until(imu_ns, dvl_ns[first + k] - 1)], known_ns[first + k])
-    return first, last, reached_ns
-
-
-def _in_frame(motion: PreintegratedMotion | None, earth: Floats) -> Floats:
-    """Earth's rotation in the last frame of a motion."""
-    return earth if motion is None else motion.i_T_j.rotation().unrotate(earth)

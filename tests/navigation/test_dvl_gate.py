@@ -10,6 +10,7 @@ from scipy.stats import chi2
 from sonar_graph.calibration import Calibration, DepthCalibration, Start
 from sonar_graph.devices.dvl_beams import UNMEASURED_M_S
 from sonar_graph.measurements import Depth, Dvl
+from sonar_graph.navigation.dvl_screening.depth_gate import DEPTH_GATE, FEWEST, UNSTATED_M, VERTICAL_M_S
 from sonar_graph.navigation.dvl_screening.dvl_gate import (
     GATE,
     LONG_NS,
@@ -18,8 +19,8 @@ from sonar_graph.navigation.dvl_screening.dvl_gate import (
     gate_velocities,
     needed,
 )
-from sonar_graph.navigation.dvl_screening.row_intake import DEPTH_GATE, FEWEST, UNSAID_M, VERTICAL_M_S
 from sonar_graph.navigation.odometry import Odometry
+from sonar_graph.navigation.samples import VelocityRows
 from sonar_graph.states import Refusal
 
 from .rows import NS, T0_NS, at, dvl, odometry_at_rest, stamps
@@ -46,13 +47,13 @@ def judged(
     cov = COVS[np.arange(len(stamps_ns)) % 2].copy()
     cov[list(partial)] += np.diag([0.0, UNMEASURED_M_S**2, UNMEASURED_M_S**2])
     n = len(known)
-    before = np.array(known, np.int64), np.zeros((n, 3)), np.tile(COVS[1], (n, 1, 1))
-    return gate_velocities(np.array(stamps_ns), np.array(velocity), cov, *before, WALK, gate)
+    before = VelocityRows(np.array(known, np.int64), np.zeros((n, 3)), np.tile(COVS[1], (n, 1, 1)))
+    return gate_velocities(VelocityRows(np.array(stamps_ns), np.array(velocity), cov), before, WALK, gate)
 
 
 def after_half_a_second(u: np.ndarray, Q_u: np.ndarray, v: np.ndarray, Q_v: np.ndarray) -> float:
-    before = np.array([0]), u[None], Q_u[None]
-    (distance,) = gate_velocities(np.array([NS // 2]), v[None], Q_v[None], *before, WALK, GATE).distance
+    before = VelocityRows(np.array([0]), u[None], Q_u[None])
+    (distance,) = gate_velocities(VelocityRows(np.array([NS // 2]), v[None], Q_v[None]), before, WALK, GATE).distance
     return distance
 
 
@@ -280,7 +281,7 @@ def test_rows_of_few_beams_wait_with_the_first_whole_ones():
 
 
 DEPTHS = Calibration(start=Start(position_m=(0.0, 0.0, -5.0)), depth=DepthCalibration(sigma_m=0.1))
-NOISE_M = np.sqrt(0.1**2 + 0.1**2 + UNSAID_M**2)
+NOISE_M = np.sqrt(0.1**2 + 0.1**2 + UNSTATED_M**2)
 
 
 def depths(seconds: list[float], z_m: list[float], variance_m2: float = np.nan) -> Depth:

@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 
 from sonar_graph.calibration import Calibration, ImuCalibration, Start
-from sonar_graph.errors import MeasurementError
 from sonar_graph.estimator import load_estimator
 from sonar_graph.measurements import Dvl, Imu, Measurements
 from sonar_graph.navigation import Odometry
 from sonar_graph.navigation.dvl_gaps import longest_open_s
 from sonar_graph.navigation.imu_gaps import Turns, closed_variance, error_in_hole, hole_ns, open_variance
-from sonar_graph.navigation.joint_preintegration import JointPreintegrator
+from sonar_graph.navigation.preintegration import Sensors
 from sonar_graph.testing import check_consistent
 
 from . import ways
@@ -82,7 +81,7 @@ def test_a_gap_that_stays_open_is_a_walk_once_accelerometers_are_less_sure_than_
     """Both variances of the limit's equation are equal there; the end of the gap brings the accelerometers back."""
     cheap = ImuCalibration(gyro_noise_density=3e-3, accel_noise_density=1e-2, accel_bias_sigma=0.05)
     known = Calibration(imu=cheap, dvl=DVL)
-    T, g, q = longest_open_s(known), known.gravity_m_s2, DVL.velocity_walk_density
+    T, g, q = longest_open_s(Sensors.of(known)), known.gravity_m_s2, DVL.velocity_walk_density
     assert 1e-4 * T**3 / 3 + (g * 3e-3) ** 2 * T**5 / 20 + 0.05**2 * T**4 / 4 == pytest.approx(q**2 * T**3 / 3)
     assert 2.0 < T < Vehicle.FOUND_S - Vehicle.LOST_S - 1.0
     (imu_rows, dvl_rows), lost_s = Vehicle().rows(), Vehicle.LOST_S
@@ -97,7 +96,7 @@ def test_a_gap_that_stays_open_is_a_walk_once_accelerometers_are_less_sure_than_
     assert after.i_T_j.equals(walk(known, imu_rows, dvl_rows, early, lost_s + T + 0.1), 1e-9)
     assert not first.i_T_j.compose(after.i_T_j).equals(rest.i_T_j, 1e-3)
     exact = ImuCalibration(gyro_noise_density=0.0, accel_noise_density=0.0, accel_bias_sigma=0.0)
-    assert longest_open_s(Calibration(imu=exact)) == np.inf
+    assert longest_open_s(Sensors.of(Calibration(imu=exact))) == np.inf
 
 
 @pytest.mark.parametrize("until_s", [16.0, 15.9, 14.0])
@@ -400,14 +399,3 @@ def test_forgetting_rows_in_a_hole_changes_nothing():
     one, other = (told.motion(at(15.0), at(18.0), np.zeros(3)).covariance for told in (whole, forgetful))
     assert np.array_equal(one, other)
     assert one[2, 2] > 1e-3
-
-
-def test_joint_preintegration_refuses_a_hole_and_names_it():
-    samples, joint = dvl(stamps(5, 8.0), 0.4, 1e-4 * np.eye(3)), JointPreintegrator(1e-4, 1e-3)
-    with pytest.raises(MeasurementError, match=rf"no row for 2 s after {at(BEGIN_S)} ns"):
-        joint.integrate(with_hole(), samples, at(2.0), at(6.0))
-    assert joint.integrate(with_hole(), samples, at(1.0), at(3.0)).duration_s == 2.0
-    tolerant = replace(joint, longest_hole_s=2.5)
-    assert tolerant.integrate(with_hole(), samples, at(2.0), at(6.0)).duration_s == 4.0
-    for rows in (with_hole(end_s=BEGIN_S + 0.05), imu(stamps(8, 8.0), 0.0)):
-        assert joint.integrate(rows, samples, at(2.0), at(6.0)).duration_s == 4.0

@@ -15,8 +15,8 @@ from baselines.invariant_ekf import InvariantEkf
 from sonar_graph.calibration import ROWS_BEFORE, Calibration, DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Dvl, Imu
-from sonar_graph.navigation import Odometry, PreintegratedMotion, dvl_gaps
-from sonar_graph.navigation import odometry as odometry_module
+from sonar_graph.navigation import Odometry, PreintegratedMotion
+from sonar_graph.navigation.preintegration import Stretch
 from sonar_graph.navigation.samples import longest_interval_ns
 from sonar_graph.simulation import MissionOptions, simulate_mission
 from sonar_graph.slam import Isam2
@@ -406,11 +406,13 @@ def test_what_is_final_is_not_integrated_again(monkeypatch):
     """Of twenty instants a second for two seconds, each takes in the rows of one Doppler interval and a bit."""
     spans_s: list[float] = []
 
-    def counted(so_far, rows, sensors, end_ns, *noise):
-        spans_s.append((end_ns - so_far.until_ns) * 1e-9)
-        return dvl_gaps.continued(so_far, rows, sensors, end_ns, *noise)
+    continued = Stretch.continued
 
-    monkeypatch.setattr(odometry_module, "continued", counted)
+    def counted(stretch, rows, sensors, removed, end_ns, known_ns):
+        spans_s.append((end_ns - stretch.until_ns) * 1e-9)
+        return continued(stretch, rows, sensors, removed, end_ns, known_ns)
+
+    monkeypatch.setattr(Stretch, "continued", counted)
     odometry = swaying()
     for offset in range(NS // 2, 2 * NS, NS // 20):
         odometry.motion(T0_NS, T0_NS + offset, BIAS)

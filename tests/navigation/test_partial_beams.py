@@ -16,7 +16,7 @@ from sonar_graph.navigation.dvl_screening.partial_beams import (
     PartialVelocities,
     carry,
 )
-from sonar_graph.navigation.samples import is_partial
+from sonar_graph.navigation.samples import VelocityRows, is_partial
 from tests.devices.test_dvl_beams import JANUS
 
 from .rows import NS, T0_NS, at
@@ -29,7 +29,8 @@ NO_FORCE = InertialRows(np.array([0, 10**12]), np.zeros((2, 3)), np.full((2, 3),
 
 def completed(stamps_ns, velocity, cov, imu=NO_FORCE, calibration=CALIBRATION):
     """All rows in one block."""
-    return PartialVelocities(calibration).completed(stamps_ns, velocity, cov, is_partial(cov), imu)
+    rows = VelocityRows(stamps_ns, velocity, cov)
+    return PartialVelocities(calibration).completed(rows, is_partial(cov), imu)
 
 
 def pings(valid, rng, velocities):

@@ -1,9 +1,8 @@
-"""Two vehicles by hand, and every way to a motion: over steps, over gaps, by each rule.
+"""Two vehicles by hand, and every way to a motion: over steps and over gaps.
 
 One rolls, pitches and turns; the other surges and sways, with a gap of its Doppler log from 6 to 16 s.
 """
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation import Odometry, PreintegratedMotion
-from sonar_graph.navigation.joint_preintegration import RULES, JointPreintegrator
 
 from .rows import T0_NS, at, dvl, stamps
 
@@ -43,11 +41,10 @@ def acceleration_at(t):
 
 
 class Way(NamedTuple):
-    """From a node to a node, or to an instant in a gap; by the odometry, or by a rule of joint preintegration."""
+    """From a node to a node, or to an instant in a gap."""
 
     start_s: float
     until_s: float
-    rule: str | None = None
     is_blind: bool = False
     interpolation: str = "linear"
 
@@ -61,8 +58,6 @@ WAYS = {
     "closed walk": Way(LOST_S, FOUND_S, is_blind=True),
     "open walk": Way(LOST_S, OPEN_S, is_blind=True),
     "two walks": Way(5.0, 16.0, is_blind=True),
-    "inertial over gaps": Way(5.0, 16.0, "inertial"),
-    **{f"rule {rule}": Way(2.0, 5.5, rule) for rule in RULES},
 }
 
 
@@ -90,13 +85,7 @@ def calibration(imu=None, body_p_imu=BODY_P_IMU, interpolation="linear", **dvl):
 
 def moved_by(way: Way, imu: Imu, dvl: Dvl, bias=(0.0, 0.0, 0.0), earth=None, known=None) -> PreintegratedMotion:
     known = calibration(interpolation=way.interpolation, **(known or {}))
-    if way.rule is None:
-        return motion(blinded(imu) if way.is_blind else imu, dvl, known, way.start_s, way.until_s, bias, earth)
-    joint = replace(JointPreintegrator.from_calibration(known, way.rule), longest_s=2.0)
-    removed = np.r_[bias, np.zeros(3)]
-    return joint.integrate(imu, dvl, at(way.start_s), at(way.until_s), removed, earth).relative_pose(
-        known.imu.accel_bias_sigma
-    )
+    return motion(blinded(imu) if way.is_blind else imu, dvl, known, way.start_s, way.until_s, bias, earth)
 
 
 def blinded(imu):

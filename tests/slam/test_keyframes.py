@@ -21,8 +21,8 @@ from sonar_graph.calibration import (
     Start,
 )
 from sonar_graph.measurements import Depth, Dvl, Heading, Imu
+from sonar_graph.motion import earth_rate_in_world
 from sonar_graph.navigation import Odometry, PreintegratedMotion
-from sonar_graph.navigation.alignment.gravity import earth_rate_in_world
 from sonar_graph.numerics import cross_matrix
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 from sonar_graph.slam import Isam2

@@ -44,7 +44,8 @@ class NoiseDensities:
 
 def allan_deviation(samples: Floats, together: int) -> Floats:
     """Overlapping Allan deviation of each of (n, columns) over means of ``together`` samples, shape (columns,)."""
-    sums = np.cumsum(np.concatenate([np.zeros((1, samples.shape[1])), samples]), axis=0)
+    before_first = np.zeros((1, samples.shape[1]))
+    sums = np.cumsum(np.concatenate([before_first, samples]), axis=0)  # (n + 1, columns)
     means = (sums[together:] - sums[:-together]) / together
     steps = means[together:] - means[:-together]
     return np.asarray(np.sqrt(0.5 * np.mean(steps**2, axis=0)))
@@ -52,14 +53,17 @@ def allan_deviation(samples: Floats, together: int) -> Floats:
 
 def degrees_of_freedom(count: int, together: int) -> float:
     """Equivalent degrees of freedom of the overlapping deviation of white noise, over ``together`` samples."""
-    n, m = count + 1, together
-    return (3 * (n - 1) / (2 * m) - 2 * (n - 2) / n) * 4 * m**2 / (4 * m**2 + 5)
+    n = count + 1  # N' of the module's equation
+    m = together
+    by_means = 3 * (n - 1) / (2 * m)
+    by_ends = 2 * (n - 2) / n
+    return (by_means - by_ends) * 4 * m**2 / (4 * m**2 + 5)
 
 
 def density(samples: Floats, rate_hz: float) -> Estimate1D:
     """Root spectral density at one second of the noisiest of (n, columns) readings of a still sensor.
 
-    Unknown where all are equal: no sensor is without noise, and an estimator told so believes it.
+    Unknown where all are equal: no sensor is without noise, and an estimator would trust such a density.
     """
     if not np.ptp(samples, axis=0).any():
         return Estimate1D(
@@ -81,32 +85,38 @@ def noise_densities(imu: Imu) -> NoiseDensities:
         return NoiseDensities(still_s, moving, moving)
     rate_hz = (len(seconds) - 1) / still_s
     force = imu.specific_force[rest]
-    measured = np.isfinite(force).all()
-    accel = density(force, rate_hz) if measured else Estimate1D(np.nan, np.inf, "no accelerometers")
-    return NoiseDensities(still_s, density(imu.angular_velocity[rest], rate_hz), accel)
+    gyro = density(imu.angular_velocity[rest], rate_hz)
+    if not np.isfinite(force).all():
+        return NoiseDensities(still_s, gyro, Estimate1D(np.nan, np.inf, "no accelerometers"))
+    return NoiseDensities(still_s, gyro, density(force, rate_hz))
 
 
 def longest_rest(imu: Imu) -> slice:
     """The longest run of rows in which the means over a second hardly change."""
-    second = ((imu.stamps_ns - imu.stamps_ns[0]) * (1e-9 / WINDOW_S)).astype(np.int64)
+    since_ns = imu.stamps_ns - imu.stamps_ns[0]
+    second = (since_ns * (1e-9 / WINDOW_S)).astype(np.int64)
     names, first, count = np.unique(second, return_index=True, return_counts=True)
     still = _steady(imu.angular_velocity, first, count, GYRO_MOTION_RAD_S)
     if np.isfinite(imu.specific_force).all():
         still &= _steady(imu.specific_force, first, count, ACCEL_MOTION_M_S2)
     still[1:] &= np.diff(names) == 1  # a hole in the log is no rest
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(int), [0]])))
+    bordered = np.concatenate([[0], still.astype(int), [0]])
+    edges = np.flatnonzero(np.diff(bordered))  # where rest begins and ends, in turn
     if not len(edges):
         return slice(0, 0)
-    begins, ends = edges[::2], edges[1::2]
+    begins = edges[::2]
+    ends = edges[1::2]
     longest = int(np.argmax(ends - begins))
+    begin = begins[longest]
     last = ends[longest] - 1
-    return slice(int(first[begins[longest]]), int(first[last] + count[last]))
+    return slice(int(first[begin]), int(first[last] + count[last]))
 
 
 def _steady(values: Floats, first: Ints, count: Ints, least: float) -> NDArray[np.bool_]:
     """True for seconds that vary no more than the quietest, and whose mean is near that of the second before."""
     means = np.add.reduceat(values, first, axis=0) / count[:, None]
-    spread = np.sqrt(np.maximum(np.add.reduceat(values**2, first, axis=0) / count[:, None] - means**2, 0.0))
+    squares = np.add.reduceat(values**2, first, axis=0) / count[:, None]
+    spread = np.sqrt(np.maximum(squares - means**2, 0.0))
     quiet = np.quantile(spread, QUIET_SHARE, axis=0)
     steps = np.abs(np.diff(means, axis=0, prepend=means[:1]))
     near = steps <= least + 5.0 * quiet * np.sqrt(2.0 / np.median(count))

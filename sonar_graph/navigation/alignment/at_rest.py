@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import AlignmentError
 from sonar_graph.measurements import Dvl, Floats, Imu
-from sonar_graph.navigation.alignment.gravity import earth_rate_in_world
+from sonar_graph.motion import earth_rate_in_world
 from sonar_graph.numerics import chi_square_exceeded
 
 LEAST_COSINE = 1e-3
@@ -35,7 +35,7 @@ class InitialTilt:
     Examples
     --------
     >>> import numpy as np
-    >>> from sonar_graph.navigation import align_at_rest
+    >>> from sonar_graph.navigation.alignment import align_at_rest
     >>> from sonar_graph.testing import still_world
     >>> world = still_world()
     >>> tilt = align_at_rest(world.imu, world.calibration)
@@ -54,18 +54,21 @@ class InitialTilt:
     covariance: Floats
     """Of [roll, pitch, gyro bias], shape (5, 5)."""
     bias_is_observed: NDArray[np.bool_]
-    """True for the axes whose bias the data tell better than the prior, shape (3,)."""
+    """True for the axes whose bias is known better from the data than from the prior, shape (3,)."""
 
 
 def roll_and_pitch(up: Floats) -> tuple[float, float]:
     """Roll and pitch (rad) from the world's up in body axes, of any length, shape (3,)."""
-    return float(np.arctan2(up[1], up[2])), float(np.arctan2(-up[0], np.hypot(up[1], up[2])))
+    x, y, z = up.tolist()
+    roll = np.arctan2(y, z)
+    pitch = np.arctan2(-x, np.hypot(y, z))
+    return float(roll), float(pitch)
 
 
 def angles_by_up(up: Floats) -> Floats:
     """Derivative of roll and pitch by up, shape (2, 3); raises AlignmentError for a nose straight up or down."""
     x, y, z = up.tolist()
-    cosine = np.hypot(y, z)
+    cosine = np.hypot(y, z)  # of pitch
     if cosine < LEAST_COSINE:
         raise AlignmentError("alignment: the nose points straight up or down, where roll has no meaning")
     by_roll = np.array([0.0, z, -y]) / cosine**2
@@ -76,7 +79,10 @@ def angles_by_up(up: Floats) -> Floats:
 def earth_up_and_level(calibration: Calibration) -> tuple[float, float]:
     """Earth's rate along up and along north, rad/s; zero without a latitude."""
     earth = earth_rate_in_world(calibration)
-    return (0.0, 0.0) if earth is None else (float(earth[2]), float(earth[1]))
+    if earth is None:
+        return 0.0, 0.0
+    _, north, up = earth.tolist()
+    return up, north
 
 
 def in_body_axes(imu: Imu, calibration: Calibration) -> Imu:
@@ -130,7 +136,7 @@ def align_at_rest(imu: Imu, calibration: Calibration, dvl: Dvl | None = None) ->
     >>> import numpy as np
     >>> from sonar_graph.calibration import Calibration
     >>> from sonar_graph.measurements import Imu
-    >>> from sonar_graph.navigation import align_at_rest
+    >>> from sonar_graph.navigation.alignment import align_at_rest
     >>> force = np.tile([0.0, 9.80665 * np.sin(0.1), 9.80665 * np.cos(0.1)], (500, 1))
     >>> tilt = align_at_rest(Imu(np.arange(500) * 10_000_000, np.zeros((500, 3)), force), Calibration())
     >>> round(tilt.roll_rad, 6)
@@ -138,12 +144,16 @@ def align_at_rest(imu: Imu, calibration: Calibration, dvl: Dvl | None = None) ->
     """
     imu = in_body_axes(imu, calibration)
     refuse_motion(imu, calibration, dvl)
-    force, rate = imu.specific_force.mean(axis=0), imu.angular_velocity.mean(axis=0)
+    force = imu.specific_force.mean(axis=0)
+    rate = imu.angular_velocity.mean(axis=0)
     up = force / np.linalg.norm(force)
     upward, _ = earth_up_and_level(calibration)
-    length_s = float(imu.stamps_ns[-1] - imu.stamps_ns[0]) * 1e-9 * len(imu) / (len(imu) - 1)  # n samples, n intervals
+    span_s = float(imu.stamps_ns[-1] - imu.stamps_ns[0]) * 1e-9
+    length_s = span_s * len(imu) / (len(imu) - 1)  # n samples stand for n intervals
+    roll, pitch = roll_and_pitch(up)
+    bias = rate - upward * up
     cov = covariance_at_rest(up, length_s, calibration)
-    return InitialTilt(int(imu.stamps_ns[-1]), *roll_and_pitch(up), rate - upward * up, cov, np.ones(3, dtype=np.bool_))
+    return InitialTilt(int(imu.stamps_ns[-1]), roll, pitch, bias, cov, np.ones(3, dtype=np.bool_))
 
 
 def covariance_at_rest(up: Floats, rest_s: float, calibration: Calibration) -> Floats:
@@ -152,7 +162,8 @@ def covariance_at_rest(up: Floats, rest_s: float, calibration: Calibration) -> F
     ``up``: unit vector ``body_R_world e_z``, shape (3,).
     """
     upward, level = earth_up_and_level(calibration)
-    sensors, across = calibration.imu, np.eye(3) - np.outer(up, up)
+    sensors = calibration.imu
+    across = np.eye(3) - np.outer(up, up)
     tilt = (sensors.accel_bias_sigma**2 + sensors.accel_noise_density**2 / rest_s) / calibration.gravity_m_s2**2
     by_up = np.concatenate([angles_by_up(up), -upward * np.eye(3)])
     covariance = by_up @ (tilt * across) @ by_up.T
@@ -175,10 +186,12 @@ def refuse_motion(imu: Imu, calibration: Calibration, dvl: Dvl | None) -> None:
         ("angular_velocity", imu.angular_velocity, "gyro_noise_density"),
     ):
         density = getattr(calibration.imu, field)
-        means = (np.add.reduceat(values, first, axis=0) / count[:, None])[:-1]
+        means = (np.add.reduceat(values, first, axis=0) / count[:, None])[:-1]  # the last block is not full
         freedom = means.size - means.shape[1]
-        ratio = np.sqrt(np.sum((means - means.mean(axis=0)) ** 2) * BLOCK_S / freedom)
-        if ratio > LARGEST_NOISE_RATIO * np.sqrt(chi_square_exceeded(FALSE_ALARM, freedom) / freedom) * density:
+        squares = np.sum((means - means.mean(axis=0)) ** 2)
+        ratio = np.sqrt(squares * BLOCK_S / freedom)
+        by_chance = np.sqrt(chi_square_exceeded(FALSE_ALARM, freedom) / freedom)
+        if ratio > LARGEST_NOISE_RATIO * by_chance * density:
             raise AlignmentError(
                 f"Imu.{name}: varies as a density of {ratio:.2g}, not imu.{field} = {density:.2g}; "
                 "the vehicle moved (give another stretch, or align in motion), or the density is too small"
@@ -188,13 +201,16 @@ def refuse_motion(imu: Imu, calibration: Calibration, dvl: Dvl | None) -> None:
         raise AlignmentError(
             f"Imu.angular_velocity: turns at {rate:.3f} rad/s on average; no rest, give another stretch"
         )
-    force, gravity = float(np.linalg.norm(imu.specific_force.mean(axis=0))), calibration.gravity_m_s2
+    force = float(np.linalg.norm(imu.specific_force.mean(axis=0)))
+    gravity = calibration.gravity_m_s2
     if abs(force / gravity - 1.0) > LARGEST_GRAVITY_ERROR:
         raise AlignmentError(
             f"Imu.specific_force: {force:.2f} m/s² on average, not {gravity:.2f}; "
             "check its unit, and that gravity is in it"
         )
-    during = None if dvl is None else dvl.between(int(imu.stamps_ns[0]) - 1, int(imu.stamps_ns[-1]))
+    if dvl is None:
+        return
+    during = dvl.between(int(imu.stamps_ns[0]) - 1, int(imu.stamps_ns[-1]))
     if during is not None:
         speed = float(np.linalg.norm(during.velocity.mean(axis=0)))
         sigma = float(np.linalg.norm(calibration.dvl.velocity_sigma_m_s)) / np.sqrt(len(during))

@@ -4,15 +4,15 @@ The frame g is the IMU's own at its first sample. With C = g_R_imu, piecewise li
 
     C <- C Exp((w_i + w_{i+1}) / 2 dt),    F(t) = int C f dt,    S(t) = int C dt,    P(t) = int [C f]x S dt
 
-Between two Doppler samples k, at their stamps plus the offset, velocity changes as the accelerometers say::
+Between two Doppler samples k, at their stamps plus the offset, velocity changes as the accelerometers measured::
 
     x_k = C_k (R v_k - w_k x l) - F_k
     x_{k+1} - x_k = -d(C R v) (s - 1) + d(C [R v]x) psi + d(C [w]x) dl - d(S) b + d(P - [C R v]x S) b_g
                     + gamma T + gamma' T t
 
 s scales the log's velocities, psi turns its mounting, dl corrects the lever arm l from IMU to log; b and b_g are the
-biases of accelerometers and gyros. Gravity gamma and its slow turning are fitted anew every half minute. Rows of one or
-two beams and rows near holes of the IMU are left out. Derivation and accuracy: docs/theory/sensor_check.md.
+biases of accelerometers and gyros. Gravity gamma and its slow turning are fitted again every half minute. Rows of one
+or two beams and rows near holes of the IMU are left out. Derivation and accuracy: docs/theory/sensor_check.md.
 """
 
 from __future__ import annotations
@@ -75,15 +75,19 @@ class InertialPath:
 
     def covers(self, seconds: Floats, margin_s: float = 0.0) -> NDArray[np.bool_]:
         """True where samples without a hole reach from a margin before an instant to a margin after it."""
-        earliest, latest = seconds - margin_s, seconds + margin_s
+        earliest = seconds - margin_s
+        latest = seconds + margin_s
         inside = (earliest >= 0) & (latest <= self.seconds[-1])
-        before = np.clip(np.searchsorted(self.seconds, earliest, side="right") - 1, 0, None)
-        after = np.clip(np.searchsorted(self.seconds, latest), None, len(self.seconds) - 1)
+        last_before = np.searchsorted(self.seconds, earliest, side="right") - 1
+        first_after = np.searchsorted(self.seconds, latest)
+        before = np.maximum(last_before, 0)
+        after = np.minimum(first_after, len(self.seconds) - 1)
         return np.asarray(inside & (self.parts[before] == self.parts[after]))
 
     def parts_at(self, seconds: Floats) -> Ints:
         """Number of holes that have ended before each instant, shape (k,)."""
-        return np.asarray(self.parts[np.clip(np.searchsorted(self.seconds, seconds, side="right") - 1, 0, None)])
+        last_before = np.searchsorted(self.seconds, seconds, side="right") - 1
+        return np.asarray(self.parts[np.maximum(last_before, 0)])
 
     def rotations_at(self, seconds: Floats) -> Floats:
         """C at instants within the samples, along the shortest arc between two, shape (k, 3, 3)."""
@@ -112,18 +116,21 @@ def holes_before(stamps_ns: Ints) -> Ints:
 
 def strapdown_integrals(seconds: Floats, rate: Floats, force: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     """C, F, S and P of the module's equations at every sample."""
-    turns = 0.5 * (rate[:-1] + rate[1:]) * np.diff(seconds)[:, None]
+    mean_rate = 0.5 * (rate[:-1] + rate[1:])
+    turns = mean_rate * np.diff(seconds)[:, None]  # (n - 1, 3)
     from scipy.integrate import cumulative_trapezoid  # takes most of a second to load
 
     integral = partial(cumulative_trapezoid, x=seconds, axis=0, initial=0.0)
-    C = running_rotations(turns)
+    C = running_rotations(turns)  # (n, 3, 3)
     felt = C @ force[:, :, None]
+    F = integral(felt[:, :, 0])
     S = integral(C)
-    return C, integral(felt[:, :, 0]), S, integral(np.cross(felt, S, axis=1))
+    P = integral(np.cross(felt, S, axis=1))
+    return C, F, S, P
 
 
 STRETCH_S = 30.0
-"""Gravity and its turning are fitted anew after this time."""
+"""Gravity and its turning are fitted again after this time."""
 MEAN_OVER_S = 1.0
 """Samples are averaged over this time: in shorter differences noise is larger than what the motion changes."""
 LEAST_ROWS = 12
@@ -131,18 +138,25 @@ LARGEST_INTERVAL = 3.0
 """In usual intervals: a longer time between two samples ends a stretch."""
 LEAST_STRETCHES = 2
 PRIOR_SIGMAS = np.array([1.0, 0.05, 0.05, 1.0, *[3.0] * 3, *[0.5] * 3, *[0.02] * 3])
-"""Scale; turn, rad, about x and y near what the calibration says; lever arm, m; biases, m/s² and rad/s."""
-SCALE, YAW, LEVER, GYRO_BIAS = 1, 4, slice(5, 8), slice(11, 14)
-"""Places among the parameters, after the offset."""
+"""Scale; turn, rad, about x and y near the calibration's; lever arm, m; biases, m/s² and rad/s."""
+# places among the parameters, after the offset
+SCALE = 1
+YAW = 4
+LEVER = slice(5, 8)
+GYRO_BIAS = slice(11, 14)
 LARGEST_STEP_LEFT = 0.01
 """Of turn (rad), scale, gyro bias over a stretch (rad) and lever arm times a usual rate (m/s): below it, linearising
 again changes nothing that matters."""
 USUAL_RATE_RAD_S = 0.1
-ROUNDS, HOPELESS_AFTER = 8, 3
-"""Most rounds, and the round after which a log is given up that tells neither offset nor turn nor scale."""
-OFFSET_LIMIT_S, YAW_LIMIT_RAD, SCALE_LIMIT = 0.1, np.radians(2.0), 0.02
-LEVER_LIMIT_M, GYRO_BIAS_LIMIT_RAD_S = 0.25, 5e-3
-"""Sigmas above which a number is reported as not known."""
+ROUNDS = 8
+HOPELESS_AFTER = 3
+"""Round after which the search ends where neither offset nor turn nor scale is known."""
+# sigmas above which a number is reported as not known
+OFFSET_LIMIT_S = 0.1
+YAW_LIMIT_RAD = np.radians(2.0)
+SCALE_LIMIT = 0.02
+LEVER_LIMIT_M = 0.25
+GYRO_BIAS_LIMIT_RAD_S = 5e-3
 NO_MANOEUVRES = "too little acceleration"
 NO_TURNS = "too little turning"
 Estimates3D = tuple[Estimate1D, Estimate1D, Estimate1D]
@@ -177,7 +191,7 @@ def match_dvl_to_imu(imu: Imu, dvl: Dvl, calibration: Calibration) -> DvlMatch:
     Parameters
     ----------
     imu, dvl
-        Rows of one run; without specific forces nothing can be told.
+        Rows of one run; without specific forces nothing is known.
     calibration
         Mountings as far as they are known; the yaw found is on top of them.
     """
@@ -188,24 +202,37 @@ def match_dvl_to_imu(imu: Imu, dvl: Dvl, calibration: Calibration) -> DvlMatch:
     seconds = path.since_origin(dvl.stamps_ns)
     inside = path.covers(seconds, RANGE_S) & ~is_partial(dvl.velocity_cov)
     body_R_dvl = calibration.dvl.mounting.pose().rotation().matrix()
-    seconds, velocity = seconds[inside], dvl.velocity[inside] @ body_R_dvl.T
+    seconds = seconds[inside]
+    velocity = dvl.velocity[inside] @ body_R_dvl.T  # (k, 3)
     runs = list(stretches_of(seconds, path.parts_at(seconds)))
     if len(runs) < LEAST_STRETCHES:
         return DvlMatch.unknown(f"less than {LEAST_STRETCHES * STRETCH_S:g} s with both and no hole of the IMU")
     lever = np.subtract(calibration.dvl.mounting.translation_m, calibration.imu.mounting.translation_m)
-    yaw, scale, gyro_bias = 0.0, 1.0, np.zeros(3)
+    yaw = 0.0
+    scale = 1.0
+    gyro_bias = np.zeros(3)
     for done in range(1, ROUNDS + 1):
+        # integrated again with the gyro bias found so far: the model is linearised about it
         path = InertialPath.of(Imu(imu.stamps_ns, imu.angular_velocity - gyro_bias, imu.specific_force))
         turned = scale * Rotation.from_rotvec([0.0, 0.0, yaw]).apply(velocity)
         line_up = partial(velocity_changes, path, seconds, turned, runs, lever)
+        # small matrices: threads of BLAS would only cost
         with threadpool_limits(1, user_api="blas"):
             found = search_offset(line_up, PRIOR_SIGMAS)
             found = found.without_shared_noise(line_up(found.offset_s), SCALE)
-        (more, turn), drift = found.fit.parameters[[SCALE, YAW]].tolist(), found.fit.parameters[GYRO_BIAS]
+        parameters = found.fit.parameters
         sigma = np.sqrt(np.diag(found.fit.covariance))
-        longer = np.where(sigma[LEVER] <= LEVER_LIMIT_M, found.fit.parameters[LEVER], 0.0)
-        yaw, scale, gyro_bias, lever = yaw + turn, scale * (1.0 + more), gyro_bias + drift, lever + longer
-        if np.linalg.norm([turn, more, *(drift * STRETCH_S), *(longer * USUAL_RATE_RAD_S)]) < LARGEST_STEP_LEFT:
+        turn = float(parameters[YAW])
+        more = float(parameters[SCALE])
+        drift = parameters[GYRO_BIAS]
+        longer = np.where(sigma[LEVER] <= LEVER_LIMIT_M, parameters[LEVER], 0.0)
+        yaw += turn
+        scale *= 1.0 + more
+        gyro_bias = gyro_bias + drift
+        lever = lever + longer
+        # each in what it changes: rad or m/s
+        step = [turn, more, *(drift * STRETCH_S), *(longer * USUAL_RATE_RAD_S)]
+        if np.linalg.norm(step) < LARGEST_STEP_LEFT:
             break
         is_known = not found.reason or sigma[YAW] <= YAW_LIMIT_RAD or sigma[SCALE] <= SCALE_LIMIT
         if done >= HOPELESS_AFTER and not is_known:
@@ -232,7 +259,8 @@ def stretches_of(seconds: Floats, parts: Ints) -> Iterator[slice]:
     if not len(intervals):
         return
     usual = float(np.median(intervals))
-    ends = np.flatnonzero((intervals > LARGEST_INTERVAL * usual) | (np.diff(parts) > 0)) + 1
+    is_end = (intervals > LARGEST_INTERVAL * usual) | (np.diff(parts) > 0)
+    ends = np.flatnonzero(is_end) + 1
     rows = max(LEAST_ROWS, round(STRETCH_S / max(usual, 1e-9)))
     for first, last in zip([0, *ends], [*ends, len(seconds)], strict=True):
         count = max(1, round((last - first - 1) / rows))
@@ -252,33 +280,44 @@ def velocity_changes(
     that the third is the vertical, nearly: what the accelerometers felt over the run.
     """
     seconds = stamped_s + offset_s
-    C, impulse = path.rotations_at(seconds), path.linear_at(seconds, path.impulse)
-    turning = C @ cross_matrices(path.linear_at(seconds, path.rate))
-    x = np.einsum("nij,nj->ni", C, velocity) - turning @ lever - impulse
-    S, P = path.linear_at(seconds, path.turned_time), path.linear_at(seconds, path.tilted_impulse)
+    C = path.rotations_at(seconds)  # (n, 3, 3)
+    F = path.linear_at(seconds, path.impulse)  # (n, 3)
+    S = path.linear_at(seconds, path.turned_time)  # (n, 3, 3)
+    P = path.linear_at(seconds, path.tilted_impulse)  # (n, 3, 3)
+    turning = C @ cross_matrices(path.linear_at(seconds, path.rate))  # C [w]x
+    x = np.einsum("nij,nj->ni", C, velocity) - turning @ lever - F
     changes = []
     for r in runs:
         since = seconds[r] - seconds[r].mean()
-        slow = np.vander(since, 3)
-        carried = impulse[r] + slow @ np.linalg.lstsq(slow, x[r], rcond=None)[0] + turning[r] @ lever
+        slow = np.vander(since, 3)  # gravity and its turning
+        line, *_ = np.linalg.lstsq(slow, x[r], rcond=None)
+        carried = F[r] + slow @ line + turning[r] @ lever  # C R v
         in_body = np.einsum("nji,nj->ni", C[r], carried)
-        S_since, P_since, F_since = S[r] - S[r][0], P[r] - P[r][0], impulse[r] - impulse[r][0]
+        S_since = S[r] - S[r][0]
+        P_since = P[r] - P[r][0]
+        F_since = F[r] - F[r][0]
         drifting = P_since - cross_matrices(F_since) @ S[r][0] - cross_matrices(carried) @ S_since
+        # by scale, mounting, lever arm, both biases: (n, 3, 13)
         columns = [-carried[:, :, None], C[r] @ cross_matrices(in_body), turning[r], -S_since, drifting]
         together = max(1, round(MEAN_OVER_S / float(np.median(np.diff(since)))))
-        whole = len(since) // together
-        t, y, A = (
-            v[: whole * together].reshape(whole, together, *v.shape[1:]).mean(axis=1)
-            for v in (since, x[r], np.concatenate(columns, axis=2))
-        )
-        felt = impulse[r][-1] - impulse[r][0]
-        level_R_g = np.asarray(Rotation.align_vectors([[0.0, 0.0, 1.0]], felt[None])[0].as_matrix())
+        t = means_over(since, together)
+        upright, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], F_since[-1:])
+        level_R_g = np.asarray(upright.as_matrix())
+        y = np.diff(means_over(x[r], together), axis=0) @ level_R_g.T
+        A = level_R_g @ np.diff(means_over(np.concatenate(columns, axis=2), together), axis=0)
         duration = np.diff(t)
         gravity = duration[:, None, None] * np.eye(3)
-        B = np.concatenate([gravity, (t[:-1] + 0.5 * duration)[:, None, None] * gravity], axis=2)
-        y, A = np.diff(y, axis=0) @ level_R_g.T, level_R_g @ np.diff(A, axis=0)
+        middle = t[:-1] + 0.5 * duration
+        B = np.concatenate([gravity, middle[:, None, None] * gravity], axis=2)  # (m, 3, 6)
         changes.append(SampleSeries(y, A, B, duration, walks=(True, True, False)))
     return changes
+
+
+def means_over(values: Floats, together: int) -> Floats:
+    """Means of so many successive values, without an incomplete last mean, shape (n // together, ...)."""
+    whole = len(values) // together
+    parts = values[: whole * together].reshape(whole, together, *values.shape[1:])
+    return np.asarray(parts.mean(axis=1))
 
 
 def cross_matrices(vectors: Floats) -> Floats:

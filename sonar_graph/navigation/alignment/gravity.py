@@ -1,4 +1,4 @@
-"""Direction of gravity from accelerometers, and the Earth's rotation.
+"""Direction of gravity from accelerometers.
 
 Over an interval of duration T from epoch i to epoch j the specific force f, turned into frame i and averaged, is the
 change of velocity plus gravity's reaction. With the velocity v of the IMU's point, dR = i_R_j and
@@ -22,8 +22,6 @@ from sonar_graph.numerics import compiled, mat, vec
 
 LEAST_GYRO_NOISE_DENSITY = 1e-7
 """rad/s/√Hz, ten times below the best fibre gyros: keeps tau finite for a gyro without noise."""
-EARTH_RATE_RAD_S = 7.292115e-5
-"""WGS 84."""
 
 
 def gravity_direction(
@@ -66,9 +64,3 @@ def tilt_sigma(
     beta = imu.accel_bias_sigma / g if has_bias else 0.0
     tau_s = (beta / max(imu.gyro_noise_density, LEAST_GYRO_NOISE_DENSITY)) ** 2
     return math.sqrt(noise + beta**2 * max(1.0, tau_s / duration_s))
-
-
-def earth_rate_in_world(calibration: Calibration) -> Floats | None:
-    """Earth's angular rate in a world with x east, y north, z up, shape (3,), rad/s; None without a latitude."""
-    latitude = calibration.earth_rate_latitude_rad
-    return None if latitude is None else EARTH_RATE_RAD_S * np.array([0.0, np.cos(latitude), np.sin(latitude)])

@@ -40,18 +40,28 @@ from sonar_graph.navigation.imu_gaps import UNFELT_NS, row_after_hole
 from sonar_graph.navigation.samples import in_numbers, is_partial
 from sonar_graph.numerics import chi_square_exceeded
 
-FEWEST, SHORTEST_S, LONGEST_S = 10, 2.0, 60.0
-"""Fewest samples of the Doppler log, the least time that they span, and the longest that is used."""
+FEWEST = 10
+"""Fewest samples of the Doppler log."""
+SHORTEST_S = 2.0
+"""Least time that they span."""
+LONGEST_S = 60.0
+"""Longest time that is used."""
 FREE = 10.0
-"""Prior sigma of velocity (m/s) and tilt (rad), of which nothing is known."""
+"""Prior sigma of velocity (m/s) and tilt (rad), so wide that it does not matter."""
 OBSERVED = 0.5
 """A bias is observed where its sigma fell below this share of the prior's."""
-ROUNDS, LARGEST_STEP_LEFT = 10, 1e-5
-"""Most rounds, and the step of tilt and of gyro bias over the stretch (rad) at which they end."""
-LARGEST_MISFIT, FALSE_ALARM = 2.25, 1e-6
+ROUNDS = 10
+LARGEST_STEP_LEFT = 1e-5
+"""Step of tilt and of gyro bias over the stretch (rad) after which the rounds end."""
+LARGEST_MISFIT = 2.25
 """Largest chi-square over its mean, beyond chance."""
-VELOCITY, TILT, GYRO, ACCEL, NORTH = slice(0, 3), slice(3, 5), slice(5, 8), slice(8, 11), slice(11, 13)
-"""Places among the 13 parameters."""
+FALSE_ALARM = 1e-6
+# places among the 13 parameters
+VELOCITY = slice(0, 3)
+TILT = slice(3, 5)
+GYRO = slice(5, 8)
+ACCEL = slice(8, 11)
+NORTH = slice(11, 13)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,12 +82,13 @@ class DopplerOnPath:
     def of(cls, path: InertialPath, seconds: Floats, velocity: Floats, R: Floats, known: Calibration) -> DopplerOnPath:
         """Take velocities in body axes and their covariances R to the IMU's point and into the path's frame."""
         lever = np.subtract(known.imu.mounting.translation_m, known.dvl.mounting.translation_m)
-        C = path.rotations_at(seconds)
+        C = path.rotations_at(seconds)  # (k, 3, 3)
         at_imu = velocity + np.cross(path.linear_at(seconds, path.rate), lever)
         turned = np.einsum("kij,kj->ki", C, at_imu)
         skewed = C @ cross_matrices(lever[None])
         rate_variance = known.imu.gyro_noise_density**2 / float(np.median(np.diff(path.seconds)))
-        R = C @ R @ C.transpose(0, 2, 1) + rate_variance * skewed @ skewed.transpose(0, 2, 1)
+        R = C @ R @ C.transpose(0, 2, 1)
+        R += rate_variance * skewed @ skewed.transpose(0, 2, 1)
         return cls(seconds, turned, turned - path.linear_at(seconds, path.impulse), skewed, R)
 
 
@@ -106,7 +117,7 @@ def align_in_motion(imu: Imu, dvl: Dvl, calibration: Calibration) -> InitialTilt
     Returns
     -------
     InitialTilt
-        Where the stretch says nothing of a bias, its sigma is the prior's, and it is marked as not observed.
+        A bias that the stretch does not determine has the prior's sigma and is marked as not observed.
 
     Raises
     ------
@@ -118,7 +129,7 @@ def align_in_motion(imu: Imu, dvl: Dvl, calibration: Calibration) -> InitialTilt
     >>> import numpy as np
     >>> from sonar_graph.calibration import Calibration
     >>> from sonar_graph.measurements import Dvl, Imu
-    >>> from sonar_graph.navigation import align_in_motion
+    >>> from sonar_graph.navigation.alignment import align_in_motion
     >>> force = np.tile([0.0, 9.80665 * np.sin(0.1), 9.80665 * np.cos(0.1)], (500, 1))
     >>> imu = Imu(np.arange(500) * 10_000_000, np.zeros((500, 3)), force)
     >>> dvl = Dvl(np.arange(25) * 200_000_000, np.tile([1.0, 0.0, 0.0], (25, 1)), np.full((25, 3, 3), np.nan))
@@ -128,7 +139,8 @@ def align_in_motion(imu: Imu, dvl: Dvl, calibration: Calibration) -> InitialTilt
     """
     imu = until_hole(in_body_axes(imu, calibration))
     seconds, velocity, R = whole_doppler_rows(imu, dvl, calibration)
-    imu = imu.rows(imu.stamps_ns <= imu.stamps_ns[0] + round((LONGEST_S + 1.0) * 1e9))
+    last_ns = imu.stamps_ns[0] + round((LONGEST_S + 1.0) * 1e9)
+    imu = imu.rows(imu.stamps_ns <= last_ns)
     upward, _ = earth_up_and_level(calibration)
     path = InertialPath.of(imu)
     doppler = DopplerOnPath.of(path, seconds, velocity, R, calibration)
@@ -138,7 +150,8 @@ def align_in_motion(imu: Imu, dvl: Dvl, calibration: Calibration) -> InitialTilt
     once = imu.rows(np.unique(imu.stamps_ns, return_index=True)[1])
     for _ in range(ROUNDS):
         earth = np.einsum("nji,j->ni", path.rotations, upward * state.up + state.north)
-        path = InertialPath.of(replace(once, angular_velocity=once.angular_velocity - state.gyro_bias - earth))
+        unbiased = once.angular_velocity - state.gyro_bias - earth
+        path = InertialPath.of(replace(once, angular_velocity=unbiased))
         doppler = DopplerOnPath.of(path, seconds, velocity, R, calibration)
         state, covariance, step, misfit = gauss_newton_step(state, path, doppler, calibration)
         if step < LARGEST_STEP_LEFT:
@@ -154,7 +167,8 @@ def align_in_motion(imu: Imu, dvl: Dvl, calibration: Calibration) -> InitialTilt
     by_step[2:, GYRO] = np.eye(3)
     joint = by_step @ covariance @ by_step.T
     observed = np.sqrt(np.diag(joint)[2:]) < OBSERVED * calibration.imu.gyro_bias_sigma
-    return InitialTilt(int(imu.stamps_ns[0]), *roll_and_pitch(state.up), state.gyro_bias, joint, observed)
+    roll, pitch = roll_and_pitch(state.up)
+    return InitialTilt(int(imu.stamps_ns[0]), roll, pitch, state.gyro_bias, joint, observed)
 
 
 def until_hole(imu: Imu) -> Imu:
@@ -175,8 +189,10 @@ def whole_doppler_rows(imu: Imu, dvl: Dvl, calibration: Calibration) -> tuple[Fl
             f"alignment: {len(seconds)} Doppler samples beside the IMU; give {FEWEST} over {SHORTEST_S:g} s or more"
         )
     body_R_dvl = calibration.dvl.mounting.pose().rotation().matrix()
-    R = in_numbers(dvl.velocity_cov[inside], np.diag(np.square(calibration.dvl.velocity_sigma_m_s)))
-    return seconds, dvl.velocity[inside] @ body_R_dvl.T, body_R_dvl @ R @ body_R_dvl.T
+    default = np.diag(np.square(calibration.dvl.velocity_sigma_m_s))
+    R = in_numbers(dvl.velocity_cov[inside], default)
+    velocity = dvl.velocity[inside] @ body_R_dvl.T
+    return seconds, velocity, body_R_dvl @ R @ body_R_dvl.T
 
 
 def gauss_newton_step(
@@ -184,12 +200,13 @@ def gauss_newton_step(
 ) -> tuple[AlignmentState, Floats, float, float]:
     """The next state, the covariance of all parameters, the size of the step, and chi-square before it."""
     upward, level = earth_up_and_level(calibration)
-    sensors, g = calibration.imu, calibration.gravity_m_s2
-    basis = _across(state.up)
-    sigma = np.repeat(
-        [FREE, FREE, sensors.gyro_bias_sigma, sensors.accel_bias_sigma, level / np.sqrt(2)], [3, 2, 3, 3, 2]
-    )
-    t, S = doppler.seconds[:, None], path.linear_at(doppler.seconds, path.turned_time)
+    sensors = calibration.imu
+    g = calibration.gravity_m_s2
+    basis = _across(state.up)  # (3, 2)
+    prior_sigmas = [FREE, FREE, sensors.gyro_bias_sigma, sensors.accel_bias_sigma, level / np.sqrt(2)]
+    sigma = np.repeat(prior_sigmas, [3, 2, 3, 3, 2])  # (13,)
+    t = doppler.seconds[:, None]  # (k, 1)
+    S = path.linear_at(doppler.seconds, path.turned_time)
     middle = 0.5 * (path.seconds[1:] + path.seconds[:-1])
     Q_steps = cross_matrices(np.diff(path.impulse, axis=0)) * middle[:, None, None]
     Q = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(Q_steps, axis=0)])
@@ -198,13 +215,15 @@ def gauss_newton_step(
     by_earth = path.linear_at(doppler.seconds, Q) - turned * t[:, None]
     by_up = (-g * t[:, None] * np.eye(3) + upward * by_earth) @ basis
     still = np.broadcast_to(np.eye(3), S.shape)
-    H = np.concatenate([still, by_up, by_gyro, -S, by_earth @ basis], axis=2).reshape(-1, 13)
+    H = np.concatenate([still, by_up, by_gyro, -S, by_earth @ basis], axis=2).reshape(-1, 13)  # (3 k, 13)
     residual = doppler.x - (state.velocity - g * t * state.up - S @ state.accel_bias)
     factor = cho_factor(noise_covariance(path, doppler, calibration), lower=True)
     root = np.tril(factor[0])
+    # whitened, and by parameters in units of their prior sigmas: a sigma of zero holds one at zero
     A = solve_triangular(root, H * sigma, lower=True)
     b = solve_triangular(root, residual.ravel(), lower=True)
-    prior = np.concatenate([np.zeros(5), state.gyro_bias, state.accel_bias, basis.T @ state.north])
+    north = basis.T @ state.north
+    prior = np.concatenate([np.zeros(5), state.gyro_bias, state.accel_bias, north])
     prior = np.divide(prior, sigma, out=np.zeros_like(prior), where=sigma > 0)
     information = cho_factor(A.T @ A + np.eye(len(sigma)))
     scaled = cho_solve(information, A.T @ b - prior)
@@ -218,8 +237,10 @@ def gauss_newton_step(
         basis @ (basis.T @ state.north + step[NORTH]),
     )
     covariance = sigma[:, None] * cho_solve(information, np.diag(sigma))
-    change = float(np.abs(step[TILT]).max() + np.abs(step[GYRO]).max() * doppler.seconds[-1])
-    return new, covariance, change, float(np.sum((b - A @ scaled) ** 2))
+    tilted = np.abs(step[TILT]).max()
+    turned_rad = np.abs(step[GYRO]).max() * doppler.seconds[-1]
+    chi_square = np.sum((b - A @ scaled) ** 2)
+    return new, covariance, float(tilted + turned_rad), float(chi_square)
 
 
 def _across(up: Floats) -> Floats:
@@ -229,15 +250,20 @@ def _across(up: Floats) -> Floats:
 
 def noise_covariance(path: InertialPath, doppler: DopplerOnPath, calibration: Calibration) -> Floats:
     """Covariance of all e of the module's equations, shape (3 k, 3 k)."""
-    sensors, t = calibration.imu, doppler.seconds
+    sensors = calibration.imu
+    t = doppler.seconds
     edges = np.concatenate([[0.0], t])
     before = t[:, None] >= t[None]  # the interval m ends at sample m
     dt = np.where(before, np.diff(edges)[None], 0.0)
     F = path.linear_at(0.5 * (edges[1:] + edges[:-1]), path.impulse)
-    arms = cross_matrices((doppler.x[:, None] + F[None]).reshape(-1, 3)).reshape(len(t), len(t), 3, 3)
-    by_turn = (sensors.gyro_noise_density * np.sqrt(dt)[:, :, None, None] * arms).transpose(0, 2, 1, 3)
-    by_turn = by_turn.reshape(3 * len(t), -1)
-    force = np.kron(sensors.accel_noise_density**2 * np.minimum(t[:, None], t[None]), np.eye(3))
-    own = np.zeros((len(t), 3, len(t), 3))
-    own[np.arange(len(t)), :, np.arange(len(t)), :] = doppler.R
+    k = len(t)
+    arms = cross_matrices((doppler.x[:, None] + F[None]).reshape(-1, 3))
+    noise = sensors.gyro_noise_density * np.sqrt(dt)[:, :, None, None]
+    by_turn = (noise * arms.reshape(k, k, 3, 3)).transpose(0, 2, 1, 3)
+    by_turn = by_turn.reshape(3 * k, -1)
+    shared_s = np.minimum(t[:, None], t[None])  # (k, k)
+    force = np.kron(sensors.accel_noise_density**2 * shared_s, np.eye(3))
+    # R_k [j = k] in its blocks
+    own = np.zeros((k, 3, k, 3))
+    own[np.arange(k), :, np.arange(k), :] = doppler.R
     return np.asarray(by_turn @ by_turn.T + force + own.reshape(force.shape))

@@ -2,7 +2,7 @@
 
 Between two poses of the reference, at their stamps plus the offset tau, the gyros turn by ``C_k^T C_{k+1}``. In the
 axes of the reference's earlier pose the difference is, to first order, that of a constant gyro bias b and of a
-rotation e that is constant in the world, such as the Earth's, both fitted anew every few minutes::
+rotation e that is constant in the world, such as the Earth's, both fitted again every few minutes::
 
     Log((R_k^T R_{k+1})^T C_k^T C_{k+1}) = b T + R_k^T e T + noise
 
@@ -45,7 +45,7 @@ class ReferenceMatch:
     offset: Estimate1D
     """To be added to its stamps, s."""
     start_heading: Estimate1D
-    """Heading of its first pose less what the rest of it and the gyros say, rad."""
+    """Heading of its first pose less that by its other poses and the gyros, rad."""
 
 
 def match_reference_to_imu(imu: Imu, reference: Trajectory, calibration: Calibration) -> ReferenceMatch:
@@ -74,16 +74,19 @@ def match_reference_to_imu(imu: Imu, reference: Trajectory, calibration: Calibra
             f"less than {LEAST_ROWS} poses, {LEAST_INTERVAL_S:g} s apart, while the IMU runs without a hole",
         )
         return ReferenceMatch(short, short)
-    seconds, world_R_imu = seconds[rows], reference.rotations()[rows] * Rotation.from_matrix(body_R_imu)
+    seconds = seconds[rows]
+    world_R_imu = reference.rotations()[rows] * Rotation.from_matrix(body_R_imu)
 
     def line_up(tau: float) -> list[SampleSeries]:
         C = Rotation.from_matrix(path.rotations_at(seconds + tau))
-        turn_by_gyro, turn_of_reference = C[:-1].inv() * C[1:], world_R_imu[:-1].inv() * world_R_imu[1:]
+        turn_by_gyro = C[:-1].inv() * C[1:]
+        turn_of_reference = world_R_imu[:-1].inv() * world_R_imu[1:]
         y = (turn_of_reference.inv() * turn_by_gyro).as_rotvec()
         duration = np.diff(seconds)
         steady = duration[:, None, None] * np.eye(3)
         from_world = duration[:, None, None] * world_R_imu[:-1].inv().as_matrix()
-        B, nothing = np.concatenate([steady, from_world], axis=2), np.empty((len(y), 3, 0))
+        B = np.concatenate([steady, from_world], axis=2)  # (m, 3, 6)
+        nothing = np.empty((len(y), 3, 0))  # no parameters are common to all stretches
         stretches = _stretches_of(path.parts_at(seconds))
         return [SampleSeries(y[rows], nothing[rows], B[rows], duration[rows]) for rows in stretches]
 
@@ -91,13 +94,15 @@ def match_reference_to_imu(imu: Imu, reference: Trajectory, calibration: Calibra
         found = search_offset(line_up, NO_PARAMETERS)
     offset = found.offset().limited(OFFSET_LIMIT_S, "too little turning")
     if not offset.is_known:
-        return ReferenceMatch(offset, Estimate1D(np.nan, np.inf, "the time offset cannot be told"))
+        return ReferenceMatch(offset, Estimate1D(np.nan, np.inf, "the time offset is not known"))
     return ReferenceMatch(offset, start_heading(path, reference, body_R_imu, offset.value))
 
 
 def _stretches_of(parts: Ints) -> list[Ints]:
     """Rows of differences between poses of one part of the path; none of short parts."""
-    within = np.split(np.arange(len(parts) - 1), np.flatnonzero(np.diff(parts)) + 1)
+    changes = np.flatnonzero(np.diff(parts)) + 1
+    within = np.split(np.arange(len(parts) - 1), changes)
+    # the last difference before a hole goes over it
     within = [rows[:-1] if k + 1 < len(within) else rows for k, rows in enumerate(within)]
     return [
         stretch
@@ -121,15 +126,19 @@ def start_heading(path: InertialPath, reference: Trajectory, body_R_imu: Floats,
     C = Rotation.from_matrix(path.rotations_at(seconds[inside]))
     world_R_imu = reference.rotations()[np.flatnonzero(inside)] * Rotation.from_matrix(body_R_imu)
     turned = world_R_imu * C.inv()  # world_R_g: constant but for drift
-    heading = (turned * turned[len(turned) // 2].inv()).as_rotvec()[:, 2]
+    middle = turned[len(turned) // 2]
+    heading = (turned * middle.inv()).as_rotvec()[:, 2]
     t = seconds[inside]
     beginning = t <= t[0] + START_SHARE * run_s
-    rest_t, rest = t[~beginning], heading[~beginning]
+    rest_t = t[~beginning]
+    rest = heading[~beginning]
     third = max(1, len(rest_t) // 3)
-    rise, run = np.median(rest[-third:]) - np.median(rest[:third]), rest_t[-third:].mean() - rest_t[:third].mean()
+    rise = np.median(rest[-third:]) - np.median(rest[:third])
+    run = rest_t[-third:].mean() - rest_t[:third].mean()
     slope = float(rise / run)
     left = rest - slope * rest_t
     level = float(np.median(left))
+    # standard deviation of a normal distribution with this median of absolute deviations
     spread = 1.4826 * float(np.median(np.abs(left - level)))
     stands_out = float(np.median(heading[beginning] - level - slope * t[beginning]))
     return Estimate1D(stands_out, max(spread, LEAST_SPREAD_RAD))

@@ -1,8 +1,8 @@
 """Time offset at which two sensors agree best, with its uncertainty or the reason why it is not known.
 
-Over a grid of offsets the data are lined up anew and fitted; Gauss-Newton steps around the best offset give its value
+Over a grid of offsets the data are lined up again and fitted; Gauss-Newton steps around the best offset give its value
 and covariance together with the other parameters. A second minimum that fits nearly as well, or a best offset at the
-end of the range, means that the motion does not tell it.
+end of the range, means that the motion does not determine it.
 
 The data are stretches: runs of m differences ``y_k = x_{k+1} - x_k`` over durations T_k, three axes each, with::
 
@@ -70,7 +70,7 @@ def fit(stretches: Sequence[SampleSeries], prior_sigmas: Floats, ratios: Floats 
     """Fit the common parameters.
 
     ``stretches``: at least one, with more differences in all than parameters. ``prior_sigmas``: of the common
-    parameters about zero, shape (p,), so wide that they matter only where the data say nothing; a parameter whose
+    parameters about zero, shape (p,), so wide that they matter only where the data determine nothing; a parameter whose
     covariance is the prior's was not observed. ``ratios``: of the noises; None: estimated from the data.
     """
     if ratios is None:
@@ -106,11 +106,14 @@ def rate_noise_power(stretches: Sequence[SampleSeries], ratios: Floats) -> float
         m = len(stretch.y)
         differences = np.diff(np.eye(m + 1), axis=0)
         factors = _factors(stretch, ratios)
-        own, _ = _orthonormal(np.concatenate([_whitened(factors[axis], stretch.B[:, axis]) for axis in range(3)]))
+        own_columns = [_whitened(factors[axis], stretch.B[:, axis]) for axis in range(3)]
+        own, _ = _orthonormal(np.concatenate(own_columns))
         power = 3.0 * m - own.shape[1]
         for axis in range(3):
-            of_samples, basis = _whitened(factors[axis], differences), own[axis * m : (axis + 1) * m]
-            power -= float(np.sum(of_samples**2) - np.sum((basis.T @ of_samples) ** 2))
+            of_samples = _whitened(factors[axis], differences)
+            basis = own[axis * m : (axis + 1) * m]
+            projected = basis.T @ of_samples
+            power -= float(np.sum(of_samples**2) - np.sum(projected**2))
         powers.append(power)
     return sum(powers)
 
@@ -118,9 +121,11 @@ def rate_noise_power(stretches: Sequence[SampleSeries], ratios: Floats) -> float
 def _factors(stretch: SampleSeries, ratios: Floats) -> list[Floats]:
     """Cholesky factor of K, shape (m, m), for each axis."""
     T = stretch.duration_s
-    m, middle = len(T), np.cumsum(T) - 0.5 * T
+    m = len(T)
+    middle = np.cumsum(T) - 0.5 * T
     walk = np.outer(T, T) * np.minimum.outer(middle, middle)
     steady = np.diag(2.0 + ratios[0] * T) - np.eye(m, k=1) - np.eye(m, k=-1)
+    # axes of a kind have the same K: one factor each
     by_kind = {walks: np.linalg.cholesky(steady + walks * ratios[1] * walk) for walks in set(stretch.walks)}
     return [np.asarray(by_kind[walks], dtype=np.float64) for walks in stretch.walks]
 
@@ -147,13 +152,14 @@ class NormalEquations:
         parts = []
         for stretch in stretches:
             m, _, p = stretch.A.shape
-            columns = np.concatenate([stretch.y[:, :, None], stretch.A, stretch.B], axis=2)
+            columns = np.concatenate([stretch.y[:, :, None], stretch.A, stretch.B], axis=2)  # (m, 3, 1 + p + q)
             factors = _factors(stretch, ratios)
-            white = np.concatenate([_whitened(factors[axis], columns[:, axis]) for axis in range(3)])
+            white = np.concatenate([_whitened(factors[axis], columns[:, axis]) for axis in range(3)])  # (3 m, ...)
             own, size = _orthonormal(white[:, 1 + p :])
             kept = white[:, : 1 + p] - own @ (own.T @ white[:, : 1 + p])
-            squares = kept.T @ kept
-            size = 2.0 * sum(float(np.log(np.diag(factor)).sum()) for factor in factors) + size
+            squares = kept.T @ kept  # of [y, A], (1 + p, 1 + p)
+            log_roots = [float(np.log(np.diag(factor)).sum()) for factor in factors]
+            size = 2.0 * sum(log_roots) + size
             parts.append((squares, 3 * m - own.shape[1], size))
         squares = [part[0] for part in parts]
         return cls(
@@ -179,11 +185,13 @@ class NormalEquations:
         """``-2 log L`` of the module's equation, but for a constant."""
         _, information, rss, _ = self.solve(prior_sigmas)
         freedom = max(self.freedom - len(prior_sigmas), 1)
-        return float(freedom * np.log(rss) + self.log_determinants + np.linalg.slogdet(information)[1])
+        _, log_information = np.linalg.slogdet(information)
+        return float(freedom * np.log(rss) + self.log_determinants + log_information)
 
 
 def _orthonormal(B: Floats) -> tuple[Floats, float]:
     """A basis of the columns' span, and ``log|B'B|`` over it."""
+    # without parameters of their own there is nothing to project out
     if not B.shape[1]:
         return B, 0.0
     U, s, _ = np.linalg.svd(B, full_matrices=False)
@@ -218,7 +226,7 @@ class Estimate1D:
 
     @property
     def is_known(self) -> bool:
-        """True where the log tells the number."""
+        """True where the number is known."""
         return not self.reason
 
     def limited(self, sigma_limit: float, reason: str) -> Estimate1D:
@@ -239,7 +247,8 @@ class OffsetFit:
 
     def offset(self) -> Estimate1D:
         """The offset as a number."""
-        return Estimate1D(self.offset_s, float(np.sqrt(self.fit.covariance[0, 0])), self.reason)
+        sigma_s = float(np.sqrt(self.fit.covariance[0, 0]))
+        return Estimate1D(self.offset_s, sigma_s, self.reason)
 
     def without_shared_noise(self, stretches: Sequence[SampleSeries], column: int) -> OffsetFit:
         """Corrected where one column of A holds the same rates' noise as y (`rate_noise_power`)."""
@@ -254,6 +263,7 @@ def search_offset(line_up: LineUp, prior_sigmas: Floats) -> OffsetFit:
     ``line_up``: gives the data for an offset; the same rows for all of them; ``prior_sigmas``: of the other common
     parameters (see `sonar_graph.navigation.alignment.time_offset.fit`), shape (p,).
     """
+    # wide first: the criterion has several minima for a periodic motion
     grid = np.arange(-RANGE_S, RANGE_S + GRID_STEP_S / 2, GRID_STEP_S)
     lined_up = [line_up(float(offset)) for offset in grid]
     ratios = fit(lined_up[len(grid) // 2], prior_sigmas).ratios
@@ -266,7 +276,7 @@ def search_offset(line_up: LineUp, prior_sigmas: Floats) -> OffsetFit:
     offset_s = float(grid[best])
     limits = offset_s - 2 * GRID_STEP_S, offset_s + 2 * GRID_STEP_S
     sigmas = np.concatenate([[PRIOR_OFFSET_S], prior_sigmas])
-    # The ratios of the grid, up to half a step off the best offset, take motion that is not lined up for noise.
+    # ratios of the grid are up to half a step off the best offset: what is not lined up there counts as noise
     offset_s = _converge(line_up, prior_sigmas, ratios, offset_s, limits).offset_s
     ratios = fit(_with_offset(line_up, offset_s, prior_sigmas, ratios), sigmas).ratios
     found = _converge(line_up, prior_sigmas, ratios, offset_s, limits)
@@ -277,8 +287,9 @@ def reason_not_unique(grid: Floats, chi2: Floats, best: int) -> str:
     """The reason why the best offset of the grid does not stand out; empty: it does."""
     if best in (0, len(grid) - 1):
         return f"no best offset within ±{RANGE_S:g} s"
-    inner = np.flatnonzero((chi2[1:-1] <= chi2[:-2]) & (chi2[1:-1] <= chi2[2:])) + 1
-    others = [i for i in (*inner, 0, len(grid) - 1) if abs(grid[i] - grid[best]) > NEIGHBOURHOOD_S]
+    is_minimum = (chi2[1:-1] <= chi2[:-2]) & (chi2[1:-1] <= chi2[2:])
+    minima = (*(np.flatnonzero(is_minimum) + 1), 0, len(grid) - 1)
+    others = [i for i in minima if abs(grid[i] - grid[best]) > NEIGHBOURHOOD_S]
     rivals = [i for i in others if chi2[i] - chi2[best] < CLEARLY_WORSE]
     if rivals:
         return f"{grid[best]:+.1f} s and {grid[rivals[0]]:+.1f} s fit as well: too little changes in the motion"
@@ -298,8 +309,8 @@ def _converge(
             break
     sigma_s = float(np.sqrt(found.covariance[0, 0]))
     is_settled = abs(float(found.parameters[0])) < max(SETTLED_SIGMAS * sigma_s, 1e-5)
-    told = f"it does not settle: after {ROUNDS} steps near {offset_s:+.2f} s the next is {step:+.2g} s"
-    return OffsetFit(found, offset_s, "" if is_settled else told)
+    unsettled = f"it does not settle: after {ROUNDS} steps near {offset_s:+.2f} s the next is {step:+.2g} s"
+    return OffsetFit(found, offset_s, "" if is_settled else unsettled)
 
 
 def _with_offset(line_up: LineUp, offset_s: float, prior_sigmas: Floats, ratios: Floats) -> list[SampleSeries]:
@@ -308,6 +319,9 @@ def _with_offset(line_up: LineUp, offset_s: float, prior_sigmas: Floats, ratios:
     p = fit(here, prior_sigmas, ratios).parameters
     stretches = []
     for h, b, a in zip(here, before, after, strict=True):
-        slope = ((a.y - a.A @ p) - (b.y - b.A @ p)) / (2 * DERIVATIVE_STEP_S)
-        stretches.append(replace(h, A=np.concatenate([-slope[:, :, None], h.A], axis=2)))
+        residual_before = b.y - b.A @ p
+        residual_after = a.y - a.A @ p
+        slope = (residual_after - residual_before) / (2 * DERIVATIVE_STEP_S)  # (m, 3)
+        with_offset = np.concatenate([-slope[:, :, None], h.A], axis=2)
+        stretches.append(replace(h, A=with_offset))
     return stretches

@@ -5,7 +5,7 @@ Gate. A velocity v, t seconds after the last one u that was accepted, both in bo
     S = Q_u + Q_v + (q^2 t + (w t |u|)^2) I,    q velocity walk of the calibration, w `TURNING_RAD_S` (w t at most 2)
 
 since the velocity may change and the vehicle may turn. The squared Mahalanobis distance is gated at `GATE`; what passes
-is weighed by its noise. A row that leaves a direction unmeasured is compared, but nothing is compared with it.
+is weighted by its noise. A row that leaves a direction unmeasured is compared, but nothing is compared with it.
 
 Confirmation. At the start there is no velocity to compare with, and long after the last accepted one (`LONG_NS`, and
 `LONG_INTERVALS` of the log's own) the gate is wide. Such a row waits. Of the waiting rows, chains are formed in which
@@ -14,9 +14,9 @@ stretch and, for a speed v of its last row, at least::
 
     2 + floor((v / s)^2) rows, at most `MOST`,     s = `USUAL_SPEED_M_S`
 
-The other rows up to its end are outliers. This assumes that of the waiting rows more are right than agree in being
+The other rows up to its end are outliers. This assumes that more of the waiting rows are right than agree in being
 wrong. The first row stays the first epoch even where its velocity was wrong: it then has that of the first accepted
-row, with the variance of what may have changed since. Of a chain that ends a gap the last row alone is used. Rows
+row, with the variance of what may have changed since. Of a chain that ends a gap only the last row is used. Rows
 more than a day apart confirm nothing. Waiting rows are no epochs. Stamps decide, not how a log is cut.
 docs/theory/gaps.md.
 """
@@ -27,10 +27,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonar_graph.measurements import Floats, Ints
-from sonar_graph.navigation.dvl_screening.partial_beams import Rows
-from sonar_graph.navigation.samples import LATEST_NS, PARTIAL_M2_S2
-from sonar_graph.navigation.steps import covariance, rows_until
-from sonar_graph.navigation.steps import row as row_of
+from sonar_graph.navigation.preintegration import covariance, row_of, rows_until
+from sonar_graph.navigation.samples import LATEST_NS, PARTIAL_M2_S2, VelocityRow, VelocityRows
 from sonar_graph.numerics import O3, ZERO, Mat3, Vec3, compiled, inlined
 from sonar_graph.sequence import PAUSE_NS
 from sonar_graph.states import Refusal, RefusedRow
@@ -53,41 +51,60 @@ class GateResult(NamedTuple):
     is_plain: bool
     """True where no row is partial or an outlier."""
 
+    @property
+    def is_accepted(self) -> Flags:
+        """Whole rows that are no outliers, shape (n,)."""
+        return ~(self.is_outlier | self.is_partial)
 
-def gate_velocities(
-    stamps: Ints, velocity: Floats, cov: Floats, known_ns: Ints, known_velocity: Floats, known_cov: Floats,
-    walk: float, gate: float,
-) -> GateResult:  # fmt: skip
+
+def gate_velocities(rows: VelocityRows, known: VelocityRows, walk: float, gate: float) -> GateResult:
     """Compare each row with the last whole one accepted, beginning with the known row before the first.
 
     ``walk`` is the root spectral density of the velocity's random walk, m/s/√s; ``gate`` the squared distance beyond
     which a row is an outlier.
     """
-    n = len(stamps)
-    out = np.zeros(n), np.zeros(n, np.bool_), np.zeros(n, np.bool_)
-    known = known_ns, known_velocity, known_cov
-    return GateResult(*out, _write_gated(stamps, velocity, cov, *known, walk, gate, *out))
+    n = len(rows.stamps_ns)
+    distance = np.zeros(n)
+    is_partial = np.zeros(n, np.bool_)
+    is_outlier = np.zeros(n, np.bool_)
+    is_plain = _write_gated(rows, known, walk, gate, distance, is_partial, is_outlier)
+    return GateResult(distance, is_partial, is_outlier, is_plain)
 
 
 @compiled
 def _write_gated(
-    stamps: Ints, velocity: Floats, cov: Floats, known_ns: Ints, known_velocity: Floats, known_cov: Floats,
-    walk: float, gate: float, distance: Floats, is_partial: Flags, is_outlier: Flags,
-) -> bool:  # fmt: skip
+    rows: VelocityRows,
+    known: VelocityRows,
+    walk: float,
+    gate: float,
+    distance: Floats,
+    is_partial: Flags,
+    is_outlier: Flags,
+) -> bool:
     """Fill the columns of `GateResult`; returns ``is_plain``."""
-    is_plain, last_ns, u, Q_u = True, LATEST_NS, ZERO, O3
-    before = rows_until(known_ns, stamps[0] - 1) - 1
+    is_plain = True
+    last_ns = LATEST_NS
+    u = ZERO
+    Q_u = O3
+    before = rows_until(known.stamps_ns, rows.stamps_ns[0] - 1) - 1
     if before >= 0:
-        last_ns, u, Q_u = known_ns[before], row_of(known_velocity, before), covariance(known_cov, before)
-    for k in range(len(stamps)):
-        v, Q_v = row_of(velocity, k), covariance(cov, k)
-        if stamps[k] > last_ns:
-            distance[k] = squared_distance(u, Q_u, v, Q_v, (stamps[k] - last_ns) * 1e-9, walk)
-        is_partial[k], is_outlier[k] = Q_v.x.x + Q_v.y.y + Q_v.z.z > PARTIAL_M2_S2, distance[k] > gate
+        last_ns = known.stamps_ns[before]
+        u = row_of(known.velocity, before)
+        Q_u = covariance(known.cov, before)
+    for k in range(len(rows.stamps_ns)):
+        stamp_ns = rows.stamps_ns[k]
+        v = row_of(rows.velocity, k)
+        Q_v = covariance(rows.cov, k)
+        if stamp_ns > last_ns:
+            distance[k] = squared_distance(u, Q_u, v, Q_v, (stamp_ns - last_ns) * 1e-9, walk)
+        is_partial[k] = Q_v.x.x + Q_v.y.y + Q_v.z.z > PARTIAL_M2_S2
+        is_outlier[k] = distance[k] > gate
         if is_partial[k] or is_outlier[k]:
             is_plain = False
         else:
-            last_ns, u, Q_u = stamps[k], v, Q_v
+            last_ns = stamp_ns
+            u = v
+            Q_u = Q_v
     return is_plain
 
 
@@ -97,18 +114,29 @@ def squared_distance(u: Vec3, Q_u: Mat3, v: Vec3, Q_v: Mat3, t: float, walk: flo
     x, y, z = v - u
     may_change = walk**2 * t + min(TURNING_RAD_S * t, 2.0) ** 2 * (u @ u)
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = Q_u + Q_v
-    xx, yy, zz = xx + may_change, yy + may_change, zz + may_change
-    a, b, c = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
-    d, e, f = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
-    return (a * x * x + d * y * y + f * z * z + 2.0 * (b * x * y + c * x * z + e * y * z)) / (xx * a + xy * b + xz * c)
+    xx += may_change
+    yy += may_change
+    zz += may_change
+    # the adjugate [[a, b, c], [b, d, e], [c, e, f]]
+    a = yy * zz - yz * yz
+    b = xz * yz - xy * zz
+    c = xy * yz - xz * yy
+    d = xx * zz - xz * xz
+    e = xy * xz - xx * yz
+    f = xx * yy - xy * xy
+    determinant = xx * a + xy * b + xz * c
+    squares = a * x * x + d * y * y + f * z * z
+    products = b * x * y + c * x * z + e * y * z
+    return (squares + 2.0 * products) / determinant
 
 
 LONG_NS = 3_000_000_000
-"""A longer time without an accepted row asks for confirmation: the gate is then 1.2 m/s wide for a vehicle at rest."""
+"""A row after a longer time without an accepted one needs confirmation: the gate of a vehicle at rest is then 1.2 m/s
+wide."""
 LONG_INTERVALS = 3
 """The same for a slow log, in its own intervals."""
 RECENT = 6
-"""Number of rows whose intervals tell how slow a log is."""
+"""Number of rows whose intervals show how slow a log is."""
 USUAL_SPEED_M_S = 2.0
 MOST = 10
 """Number of rows that are enough for any speed."""
@@ -116,19 +144,10 @@ MOST_WAITING = 5 * MOST
 """Most rows that wait; beyond, the oldest is refused."""
 
 
-class WaitingRow(NamedTuple):
-    """A row that is not confirmed yet, body axes."""
-
-    stamp_ns: int
-    velocity: Floats
-    cov: Floats
-    is_partial: bool
-
-
 class Confirmed(NamedTuple):
     """Rows that may go on to the gate, and those that are refused."""
 
-    rows: Rows
+    rows: VelocityRows
     refused: list[RefusedRow]
     """Outliers have the squared distance from the nearest accepted row."""
 
@@ -142,7 +161,7 @@ class VelocityConfirmation:
     def __init__(self, walk: float) -> None:
         self._walk = walk
         self._recent_ns: list[int] = []
-        self._waiting: list[WaitingRow] = []
+        self._waiting: list[VelocityRow] = []
 
     @property
     def waiting_ns(self) -> list[int]:
@@ -156,60 +175,73 @@ class VelocityConfirmation:
         if stamps_ns[-1] - self._recent_ns[-1] <= LONG_NS:
             return True
         known_ns = np.r_[self._recent_ns[-1], whole_ns]
-        return bool((stamps_ns - known_ns[np.searchsorted(known_ns, stamps_ns) - 1] <= LONG_NS).all())
+        since_ns = stamps_ns - known_ns[np.searchsorted(known_ns, stamps_ns) - 1]
+        return bool((since_ns <= LONG_NS).all())
 
     def accept(self, whole_ns: Ints) -> None:
-        """Take note of whole rows that the gate accepted."""
-        if len(whole_ns):
-            recent = whole_ns[-RECENT:].tolist()
-            if self._recent_ns and recent[0] <= self._recent_ns[-1]:
-                recent = sorted({*self._recent_ns, *recent})
-            else:
-                recent = self._recent_ns + recent
-            self._recent_ns = recent[-RECENT:]
+        """Remember whole rows that the gate accepted."""
+        if not len(whole_ns):
+            return
+        recent = whole_ns[-RECENT:].tolist()
+        if self._recent_ns and recent[0] <= self._recent_ns[-1]:
+            recent = sorted({*self._recent_ns, *recent})
+        else:
+            recent = self._recent_ns + recent
+        self._recent_ns = recent[-RECENT:]
 
-    def confirm(self, stamp_ns: int, velocity: Floats, cov: Floats, *, is_partial: bool) -> Confirmed:
-        """Take in one row; return those, of it and the waiting ones, that may go on."""
-        row = WaitingRow(stamp_ns, velocity, cov, is_partial)
-        must_wait = bool(self._waiting) or not row.is_partial
-        if self._recent_ns:
-            intervals = np.diff(self._recent_ns)
-            long_ns = max(LONG_NS, LONG_INTERVALS * int(intervals.min())) if len(intervals) else LONG_NS
-            since_ns = stamp_ns - self._recent_ns[-1]
-            must_wait = since_ns > 0 and (bool(self._waiting) or (since_ns > long_ns and not row.is_partial))
-        if not must_wait:
-            return Confirmed(_columns([row]), [])
-        if stamp_ns not in self.waiting_ns:
+    def confirm(self, row: VelocityRow) -> Confirmed:
+        """Add one row; return those, of it and the waiting ones, that may go on."""
+        if not self._must_wait(row):
+            return Confirmed(VelocityRows.of([row]), [])
+        if row.stamp_ns not in self.waiting_ns:
             self._waiting = sorted([*self._waiting, row], key=lambda waiting: waiting.stamp_ns)
-        refused = [
-            RefusedRow("dvl", old.stamp_ns, Refusal.UNCONFIRMED, np.nan) for old in self._waiting[:-MOST_WAITING]
-        ]
+        beyond = self._waiting[:-MOST_WAITING]
+        refused = [RefusedRow("dvl", old.stamp_ns, Refusal.UNCONFIRMED, np.nan) for old in beyond]
         self._waiting = self._waiting[-MOST_WAITING:]
+        # a clock that was set meanwhile: rows before the step confirm nothing after it
         newest_ns = self._waiting[-1].stamp_ns
         apart = [old.stamp_ns for old in self._waiting if newest_ns - old.stamp_ns > PAUSE_NS]
         refused += [RefusedRow("dvl", old_ns, Refusal.CLOCK, np.nan) for old_ns in apart]
         self._waiting = self._waiting[len(apart) :]
         chain = self.first_accepted_chain()
-        return Confirmed(_columns(self.release(chain, refused) if chain else []), refused)
+        released = self.release(chain, refused) if chain else []
+        return Confirmed(VelocityRows.of(released), refused)
 
-    def first_accepted_chain(self) -> list[WaitingRow]:
-        """The first chain of waiting rows that is long enough and a majority of its stretch; empty if there is none."""
+    def _must_wait(self, row: VelocityRow) -> bool:
+        is_waiting = bool(self._waiting)
+        if not self._recent_ns:
+            return is_waiting or not row.is_partial
+        intervals = np.diff(self._recent_ns)
+        long_ns = LONG_NS
+        if len(intervals):
+            # the gate of a slow log is wide anyway
+            long_ns = max(LONG_NS, LONG_INTERVALS * int(intervals.min()))
+        since_ns = row.stamp_ns - self._recent_ns[-1]
+        return since_ns > 0 and (is_waiting or (since_ns > long_ns and not row.is_partial))
+
+    def first_accepted_chain(self) -> list[VelocityRow]:
+        """The first chain of waiting rows that is long enough and a majority of its stretch; empty without one."""
         whole = [row for row in self._waiting if not row.is_partial]
-        chains: list[list[WaitingRow]] = []
+        chains: list[list[VelocityRow]] = []
         for row in whole:
             before = [chain for chain in chains if self._distance(chain[-1], row) <= GATE]
-            chain = [*max(before, key=lambda one: (len(one), one[-1].stamp_ns), default=[]), row]
+            longest = max(before, key=lambda one: (len(one), one[-1].stamp_ns), default=[])
+            chain = [*longest, row]
             for begin in range(len(chain) - needed(row.velocity) + 1):
                 part = chain[begin:]
-                if 2 * len(part) > sum(part[0].stamp_ns <= one.stamp_ns <= part[-1].stamp_ns for one in whole):
+                in_stretch = sum(part[0].stamp_ns <= one.stamp_ns <= part[-1].stamp_ns for one in whole)
+                if 2 * len(part) > in_stretch:
                     return part
             chains.append(chain)
         return []
 
-    def release(self, chain: list[WaitingRow], refused: list[RefusedRow]) -> list[WaitingRow]:
+    def release(self, chain: list[VelocityRow], refused: list[RefusedRow]) -> list[VelocityRow]:
         """Stop waiting up to the end of an accepted chain; rows outside it are refused, of a gap all but the last."""
-        stamps, end_ns, is_start = {row.stamp_ns for row in chain}, chain[-1].stamp_ns, not self._recent_ns
-        found: list[WaitingRow] = []
+        # at the start all rows of the chain become epochs, after a gap its last one ends the gap
+        stamps = {row.stamp_ns for row in chain}
+        end_ns = chain[-1].stamp_ns
+        is_start = not self._recent_ns
+        found: list[VelocityRow] = []
         for row in self._waiting:
             if row.stamp_ns > end_ns:
                 break
@@ -219,31 +251,30 @@ class VelocityConfirmation:
             distance = min(self._distance(row, other) for other in chain)
             refused.append(RefusedRow("dvl", row.stamp_ns, Refusal.OUTLIER, distance))
             if is_start and row.stamp_ns < chain[0].stamp_ns:
-                first, t = chain[0], (chain[0].stamp_ns - row.stamp_ns) * 1e-9
-                turned = min(TURNING_RAD_S * t, 2.0) ** 2 * float(first.velocity @ first.velocity)
-                may_change = self._walk**2 * t + turned
-                found.append(WaitingRow(row.stamp_ns, first.velocity, first.cov + may_change * np.eye(3), False))
+                found.append(self._instead(row, chain[0]))
         self._waiting = [row for row in self._waiting if row.stamp_ns > end_ns]
         if is_start:
             return found
         refused += [RefusedRow("dvl", row.stamp_ns, Refusal.WAITED, np.nan) for row in found[:-1]]
         return found[-1:]
 
-    def _distance(self, one: WaitingRow, other: WaitingRow) -> float:
-        """Squared distance; the slower of the two says how much turning can change."""
+    def _instead(self, wrong: VelocityRow, first: VelocityRow) -> VelocityRow:
+        """The velocity of a later row at the stamp of a wrong one, with the variance of what may have changed."""
+        t = (first.stamp_ns - wrong.stamp_ns) * 1e-9
+        turned = min(TURNING_RAD_S * t, 2.0) ** 2 * float(first.velocity @ first.velocity)
+        may_change = self._walk**2 * t + turned
+        return VelocityRow(wrong.stamp_ns, first.velocity, first.cov + may_change * np.eye(3))
+
+    def _distance(self, one: VelocityRow, other: VelocityRow) -> float:
+        """Squared distance; the slower of the two decides how much turning can change."""
+        # S depends on the speed of the earlier row: the smaller of both gives the narrower gate
         fast, slow = sorted((one, other), key=lambda row: -float(row.velocity @ row.velocity))
-        slow, fast = slow._replace(stamp_ns=0), fast._replace(stamp_ns=abs(other.stamp_ns - one.stamp_ns))
-        return float(gate_velocities(*_columns([fast]), *_columns([slow]), self._walk, GATE).distance[0])
+        since_ns = abs(other.stamp_ns - one.stamp_ns)
+        known = VelocityRows.of([slow._replace(stamp_ns=0)])
+        rows = VelocityRows.of([fast._replace(stamp_ns=since_ns)])
+        return float(gate_velocities(rows, known, self._walk, GATE).distance[0])
 
 
 def needed(velocity: Floats) -> int:
     """Number of rows of a chain that are enough for a velocity."""
     return min(2 + int(float(velocity @ velocity) / USUAL_SPEED_M_S**2), MOST)
-
-
-def _columns(rows: list[WaitingRow]) -> Rows:
-    return (
-        np.array([row.stamp_ns for row in rows], dtype=np.int64),
-        np.array([row.velocity for row in rows]).reshape(-1, 3),
-        np.array([row.cov for row in rows]).reshape(-1, 3, 3),
-    )

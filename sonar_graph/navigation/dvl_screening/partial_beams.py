@@ -24,7 +24,7 @@ The walk over a stretch of T seconds, turned by phi in all, has for q^2 the sum 
     a bias that turns            (b_a phi)^2 T / 16         the same
 
 b includes the Earth's rotation. A partial row before the first whole one, late, or in a stretch longer than
-`LONGEST_STRETCH_NS` is passed over. docs/theory/beams.md.
+`LONGEST_STRETCH_NS` is not used. docs/theory/beams.md.
 """
 
 from __future__ import annotations
@@ -38,9 +38,12 @@ from scipy.spatial.transform import Rotation
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.navigation.imu_gaps import UNFELT_NS, row_after_hole
+from sonar_graph.navigation.samples import VelocityRow, VelocityRows
 from sonar_graph.numerics import running_rotations
 
 EARTH_RATE_RAD_S = 7.3e-5
+LONGEST_STRETCH_NS = 60_000_000_000
+"""Longest stretch that is solved: its size stays small, and no accelerometer carries a velocity longer."""
 
 
 class InertialRows(NamedTuple):
@@ -52,8 +55,21 @@ class InertialRows(NamedTuple):
 
     def at(self, values: Floats, stamps_ns: Ints) -> Floats:
         """Values of these rows at other stamps: linear between rows, the nearest beyond them."""
-        seconds, known_s = (stamps_ns - self.stamps_ns[0]) * 1e-9, (self.stamps_ns - self.stamps_ns[0]) * 1e-9
+        seconds = (stamps_ns - self.stamps_ns[0]) * 1e-9
+        known_s = (self.stamps_ns - self.stamps_ns[0]) * 1e-9
         return np.column_stack([np.interp(seconds, known_s, values[:, axis]) for axis in range(3)])
+
+    def around(self, first_ns: int, last_ns: int) -> InertialRows | None:
+        """The rows for an interval, none after it; None where a force was not measured in it."""
+        first = max(int(np.searchsorted(self.stamps_ns, first_ns, side="right")) - 1, 0)
+        known = int(np.searchsorted(self.stamps_ns, last_ns, side="right"))
+        rows = slice(first, known)
+        within = InertialRows(self.stamps_ns[rows], self.rate[rows], self.specific_force[rows])
+        # what is a hole depends on intervals before the first of these rows as well
+        with_hole = row_after_hole(self.stamps_ns, first, known - 1, UNFELT_NS) >= 0
+        if with_hole or not len(within.stamps_ns) or not np.isfinite(within.specific_force).all():
+            return None
+        return within
 
 
 class Carry(NamedTuple):
@@ -73,36 +89,39 @@ class Carry(NamedTuple):
 
 def carry(imu: InertialRows, stamps_ns: Ints, calibration: Calibration) -> Carry:
     """Integrate from the first to each of the Doppler rows, with IMU rows stamped no later than the last."""
-    n, known = len(stamps_ns), int(np.searchsorted(imu.stamps_ns, stamps_ns[-1], side="right"))
-    first = max(int(np.searchsorted(imu.stamps_ns, stamps_ns[0], side="right")) - 1, 0)
-    with_hole = row_after_hole(imu.stamps_ns, first, known - 1, UNFELT_NS) >= 0  # typical: by the rows before as well
-    rows = slice(first, known)
-    imu = InertialRows(imu.stamps_ns[rows], imu.rate[rows], imu.specific_force[rows])
-    if not len(imu.stamps_ns) or with_hole or not np.isfinite(imu.specific_force).all():
+    n = len(stamps_ns)
+    felt = imu.around(int(stamps_ns[0]), int(stamps_ns[-1]))
+    if felt is None:
         still = np.tile(np.eye(3), (n, 1, 1))
-        return Carry(still, np.zeros((n, 3)), np.zeros((n, 3)), calibration.dvl.velocity_walk_density, False)
-    times_ns = np.union1d(stamps_ns, imu.stamps_ns[imu.stamps_ns > stamps_ns[0]])
+        nothing = np.zeros((n, 3))
+        return Carry(still, nothing, nothing, calibration.dvl.velocity_walk_density, False)
+    times_ns = np.union1d(stamps_ns, felt.stamps_ns[felt.stamps_ns > stamps_ns[0]])
     middles_ns = times_ns[:-1] + np.diff(times_ns) // 2
-    turns = imu.at(imu.rate, middles_ns) * (np.diff(times_ns) * 1e-9)[:, None]
-    gains = imu.at(imu.specific_force, middles_ns) * (np.diff(times_ns) * 1e-9)[:, None]
-    rotation, velocity = running_rotations(turns), np.zeros((len(times_ns), 3))
-    gained = rotation[:-1] @ Rotation.from_rotvec(0.5 * turns).as_matrix() @ gains[:, :, None]
+    dt = (np.diff(times_ns) * 1e-9)[:, None]
+    turns = felt.at(felt.rate, middles_ns) * dt
+    gains = felt.at(felt.specific_force, middles_ns) * dt
+    rotation = running_rotations(turns)
+    in_middle = rotation[:-1] @ Rotation.from_rotvec(0.5 * turns).as_matrix()
+    velocity = np.zeros((len(times_ns), 3))
+    gained = in_middle @ gains[:, :, None]  # (steps, 3, 1)
     velocity[1:] = np.cumsum(gained[:, :, 0], axis=0)
     at = np.searchsorted(times_ns, stamps_ns)
-    arm = np.subtract(calibration.imu.mounting.translation_m, calibration.dvl.mounting.translation_m)
-    stretch_s, sensors, g = float(stamps_ns[-1] - stamps_ns[0]) * 1e-9, calibration.imu, calibration.gravity_m_s2
-    bias2 = sensors.gyro_bias_sigma**2 + EARTH_RATE_RAD_S**2
-    by_gyro = g**2 * (sensors.gyro_noise_density**2 * stretch_s**2 / 12.0 + bias2 * stretch_s**3 / 16.0)
+    lever = np.subtract(calibration.imu.mounting.translation_m, calibration.dvl.mounting.translation_m)
+    from_lever = np.cross(felt.at(felt.rate, stamps_ns), lever)
+    stretch_s = float(stamps_ns[-1] - stamps_ns[0]) * 1e-9
     turned_rad = float(np.linalg.norm(turns, axis=1).sum())
+    density = walk_density(calibration, stretch_s, turned_rad)
+    return Carry(rotation[at], velocity[at], from_lever, density, True)
+
+
+def walk_density(calibration: Calibration, stretch_s: float, turned_rad: float) -> float:
+    """Q of a stretch, m/s/√s, by the module's table."""
+    sensors = calibration.imu
+    bias2 = sensors.gyro_bias_sigma**2 + EARTH_RATE_RAD_S**2
+    tilting = sensors.gyro_noise_density**2 * stretch_s**2 / 12.0 + bias2 * stretch_s**3 / 16.0
     by_turning = (sensors.accel_bias_sigma * turned_rad) ** 2 * stretch_s / 16.0
-    density = float(np.sqrt(sensors.accel_noise_density**2 + by_gyro + by_turning))
-    return Carry(rotation[at], velocity[at], np.cross(imu.at(imu.rate, stamps_ns), arm), density, True)
-
-
-LONGEST_STRETCH_NS = 60_000_000_000
-"""Longest stretch that is solved: its size stays small, and no accelerometer carries a velocity longer."""
-Rows = tuple[Ints, Floats, Floats]
-"""Stamps, shape (n,), velocities (n, 3) and covariances (n, 3, 3), body axes."""
+    by_gyro = calibration.gravity_m_s2**2 * tilting
+    return float(np.sqrt(sensors.accel_noise_density**2 + by_gyro + by_turning))
 
 
 class PartialVelocities:
@@ -113,108 +132,119 @@ class PartialVelocities:
 
     def __init__(self, calibration: Calibration) -> None:
         self._calibration = calibration
-        self._whole: _Row | None = None
-        self._waiting: list[_Row] = []
-        self._passed_over_ns: list[int] = []
+        self._whole: VelocityRow | None = None
+        """The newest whole row."""
+        self._shared = np.zeros((3, 3))
+        """S of equation (3), m²/s: what it shares with the rows that it closed; zero where it closed no stretch."""
+        self._waiting: list[VelocityRow] = []
+        self._not_used_ns: list[int] = []
 
     @property
     def not_completed_ns(self) -> list[int]:
-        """Stamps of the rows that were passed over, and of those that wait."""
-        return [*self._passed_over_ns, *(row.stamp_ns for row in self._waiting)]
+        """Stamps of the rows that are not used, and of those that wait."""
+        return [*self._not_used_ns, *(row.stamp_ns for row in self._waiting)]
 
     @property
     def is_waiting(self) -> bool:
         """True while a row waits for the next whole one."""
         return bool(self._waiting)
 
-    def remember(self, stamps_ns: Ints, velocity: Floats, covs: Floats) -> None:
-        """Take note of rows that are all whole, while none waits: `completed` would return them as they are."""
-        if self._whole is None or stamps_ns[-1] > self._whole.stamp_ns:
-            self._whole = _Row(int(stamps_ns[-1]), velocity[-1], covs[-1])
+    def remember(self, rows: VelocityRows) -> None:
+        """Remember rows that are all whole, while none waits: `completed` would return them as they are."""
+        stamp_ns = int(rows.stamps_ns[-1])
+        self._remember(VelocityRow(stamp_ns, rows.velocity[-1], rows.cov[-1]))
 
-    def completed(
-        self, stamps_ns: Ints, velocity: Floats, covs: Floats, partial: NDArray[np.bool_], imu: InertialRows
-    ) -> Rows:
+    def completed(self, rows: VelocityRows, is_partial: NDArray[np.bool_], imu: InertialRows) -> VelocityRows:
         """The rows that can be used now, all with a whole velocity; they may be older than those given.
 
-        Rows come in order and without NaN; ``partial`` is True for those that leave a direction unmeasured, shape (n,).
+        Rows come in order and without NaN; ``is_partial`` marks those that leave a direction unmeasured, shape (n,).
         """
-        usable: list[_Row] = []
-        for stamp_ns, v, cov, is_part in zip(stamps_ns.tolist(), velocity, covs, partial.tolist(), strict=True):
-            row = _Row(stamp_ns, v, cov)
+        usable: list[VelocityRow] = []
+        for stamp_ns, velocity, cov, partial in zip(*rows, is_partial.tolist(), strict=True):
+            row = VelocityRow(int(stamp_ns), velocity, cov)
             newest = self._waiting[-1] if self._waiting else self._whole
-            if not is_part:
+            if not partial:
                 usable += [*self.close_stretch(row, imu), row]
-            elif newest is not None and stamp_ns > newest.stamp_ns:
+            elif newest is not None and row.stamp_ns > newest.stamp_ns:
                 self._waiting.append(row)
             else:
-                self._passed_over_ns.append(stamp_ns)
-        return (
-            np.array([row.stamp_ns for row in usable], dtype=np.int64),
-            np.array([row.velocity for row in usable]).reshape(-1, 3),
-            np.array([row.cov for row in usable]).reshape(-1, 3, 3),
-        )
+                self._not_used_ns.append(row.stamp_ns)
+        return VelocityRows.of(usable)
 
-    def close_stretch(self, row: _Row, imu: InertialRows) -> list[_Row]:
+    def close_stretch(self, row: VelocityRow, imu: InertialRows) -> list[VelocityRow]:
         """The rows that waited for a whole one, completed."""
         within = [waiting for waiting in self._waiting if waiting.stamp_ns < row.stamp_ns]
         self._waiting = [waiting for waiting in self._waiting if waiting.stamp_ns > row.stamp_ns]
         whole = self._whole
-        if whole is None or row.stamp_ns > whole.stamp_ns:
-            self._whole = row
+        shared = self._shared
+        self._remember(row)
+        # rows before the first whole one cannot be completed
         if not within or whole is None:
             return []
         if row.stamp_ns - whole.stamp_ns > LONGEST_STRETCH_NS:
-            self._passed_over_ns += [waiting.stamp_ns for waiting in within]
+            self._not_used_ns += [waiting.stamp_ns for waiting in within]
             return []
-        completed, self._whole = solve_stretch([whole, *within, row], imu, self._calibration)
+        self._whole = row
+        completed, self._shared = solve_stretch([whole, *within, row], shared, imu, self._calibration)
         return completed
 
-
-class _Row(NamedTuple):
-    stamp_ns: int
-    velocity: Floats
-    cov: Floats
-    with_closed: Floats = np.zeros((3, 3))
-    """S of equation (3), m^2/s: zero where the row closed no stretch."""
+    def _remember(self, row: VelocityRow) -> None:
+        """Make a whole row the newest one, unless it is older."""
+        if self._whole is None or row.stamp_ns > self._whole.stamp_ns:
+            self._whole = row
+            self._shared = np.zeros((3, 3))
 
 
-def solve_stretch(rows: list[_Row], imu: InertialRows, calibration: Calibration) -> tuple[list[_Row], _Row]:
-    """All rows but the first and the last, completed, and the last with what it shares with them."""
+def solve_stretch(
+    rows: list[VelocityRow], shared: Floats, imu: InertialRows, calibration: Calibration
+) -> tuple[list[VelocityRow], Floats]:
+    """All rows but the first and the last, completed, and S of the last; ``shared``: S of the first."""
     stamps_ns = np.array([row.stamp_ns for row in rows], dtype=np.int64)
-    by, intervals_s = carry(imu, stamps_ns, calibration), np.diff(stamps_ns) * 1e-9
+    by = carry(imu, stamps_ns, calibration)
+    intervals_s = np.diff(stamps_ns) * 1e-9
     y, P = least_squares(rows, by, intervals_s)
-    before_s, after_s = np.r_[intervals_s[:1], intervals_s], np.r_[intervals_s, intervals_s[-1:]]
-    weights_s = 0.5 * (before_s + after_s)  # the intervals at the ends are taken to go on as they are
-    first_weight_s = weights_s[0] * np.eye(3) + np.linalg.solve(rows[0].cov, rows[0].with_closed)
+    # the intervals at the ends are taken to go on as they are
+    before_s = np.r_[intervals_s[:1], intervals_s]
+    after_s = np.r_[intervals_s, intervals_s[-1:]]
+    w = 0.5 * (before_s + after_s)
+    w_0 = w[0] * np.eye(3) + np.linalg.solve(rows[0].cov, shared)
     completed = []
     for k in range(1, len(rows) - 1):
-        with_all = P[3 * k : 3 * k + 3].reshape(3, -1, 3)
-        once = np.einsum("ajb,j->ab", with_all[:, 1:-1], weights_s[1:-1])
-        total = once + 2.0 * (with_all[:, 0] @ first_weight_s + weights_s[-1] * with_all[:, -1])
-        shared = np.asarray(0.5 * (total + total.T) / weights_s[k])  # (2) and (3), axes of frame 0
+        P_k = P[3 * k : 3 * k + 3].reshape(3, -1, 3)  # with all rows, (3, n, 3)
+        once = np.einsum("ajb,j->ab", P_k[:, 1:-1], w[1:-1])
+        with_ends = P_k[:, 0] @ w_0 + w[-1] * P_k[:, -1]
+        total = once + 2.0 * with_ends
+        cov_k = 0.5 * (total + total.T) / w[k]  # (2) and (3), axes of frame 0
         R = by.rotation[k]
         velocity = R.T @ (y[k] + by.velocity[k]) - by.from_lever[k]
-        variances, axes = np.linalg.eigh(R.T @ shared @ R)  # sharing may leave a direction of one row below zero
-        completed.append(_Row(rows[k].stamp_ns, velocity, np.asarray((axes * np.maximum(variances, 1e-12)) @ axes.T)))
+        # sharing may leave a direction of one row below zero
+        variances, axes = np.linalg.eigh(R.T @ cov_k @ R)
+        cov = np.asarray((axes * np.maximum(variances, 1e-12)) @ axes.T)
+        completed.append(VelocityRow(rows[k].stamp_ns, velocity, cov))
     R = by.rotation[-1]
-    with_closed = np.einsum("akb,k->ab", P[-3:].reshape(3, -1, 3)[:, 1:-1], weights_s[1:-1])
-    return completed, rows[-1]._replace(with_closed=R.T @ with_closed @ R)
+    P_m = P[-3:].reshape(3, -1, 3)
+    shared_next = np.einsum("akb,k->ab", P_m[:, 1:-1], w[1:-1])  # axes of frame 0
+    return completed, R.T @ shared_next @ R
 
 
-def least_squares(rows: list[_Row], by: Carry, intervals_s: Floats) -> tuple[Floats, Floats]:
+def least_squares(rows: list[VelocityRow], by: Carry, intervals_s: Floats) -> tuple[Floats, Floats]:
     """Equation (1): y, shape (n, 3), and its joint covariance, shape (3n, 3n)."""
     n = len(rows)
     size = 3 * n + (3 if by.is_inertial else 0)
-    information, vector = np.zeros((size, size)), np.zeros(size)
+    information = np.zeros((size, size))
+    vector = np.zeros(size)
     for k, row in enumerate(rows):
-        R, at = by.rotation[k], slice(3 * k, 3 * k + 3)
+        R = by.rotation[k]
+        at = slice(3 * k, 3 * k + 3)
         measured = np.linalg.inv(R @ row.cov @ R.T)
         information[at, at] += measured
-        vector[at] += measured @ (R @ (row.velocity + by.from_lever[k]) - by.velocity[k])
+        y_measured = R @ (row.velocity + by.from_lever[k]) - by.velocity[k]
+        vector[at] += measured @ y_measured
+    # y_k+1 - y_k - g T_k is a walk
     for k, interval_s in enumerate(intervals_s.tolist()):
         step = np.zeros((3, size))
-        step[:, 3 * k : 3 * k + 3], step[:, 3 * k + 3 : 3 * k + 6] = -np.eye(3), np.eye(3)
+        step[:, 3 * k : 3 * k + 3] = -np.eye(3)
+        step[:, 3 * k + 3 : 3 * k + 6] = np.eye(3)
         if by.is_inertial:
             step[:, 3 * n :] = -interval_s * np.eye(3)
         information += step.T @ step / (by.walk_density**2 * interval_s)
