@@ -85,7 +85,7 @@ class OdometryError:
 
 
 class OdometryWithBias(gtsam.CustomFactor):
-    """Relative pose from preintegrated gyro and DVL, and the biases b, of which ``D_bias`` has a column each.
+    """Relative pose from preintegrated gyro and DVL, and the biases b; ``D_bias`` has a column for each.
 
     ``up_j``: u when the motion was set, shape (3,), along which ``D_bias`` has that turn; zero without gravity.
     """
