@@ -228,7 +228,7 @@ def gravity_with_bias(
 
 
 def huber(noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
-    """Noise of headings and position fixes, of which some are outliers."""
+    """Noise of headings and position fixes, with Huber's kernel against outliers."""
     return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(HUBER_WIDTHS[noise.dim()]), noise)
 
 

@@ -85,7 +85,7 @@ class OdometryError:
 
 
 class OdometryWithBias(gtsam.CustomFactor):
-    """Relative pose from preintegrated gyro and DVL, and the biases b, of which ``D_bias`` has a column each.
+    """Relative pose from preintegrated gyro and DVL, and the biases b; ``D_bias`` has a column for each.
 
     ``up_j``: u when the motion was set, shape (3,), along which ``D_bias`` has that turn; zero without gravity.
     """
@@ -101,7 +101,7 @@ class OdometryWithBias(gtsam.CustomFactor):
         super().__init__(gaussian(motion.covariance), [key_i, key_j, bias_key], self.law)
 
 
-class Motions(NamedTuple):
+class BiasedMotions(NamedTuple):
     """Constants of n motions."""
 
     i_T_j: Floats
@@ -125,7 +125,7 @@ class OdometryStack:
         self._bias_of = np.searchsorted(self._bias_keys, [keys[2] for keys in self._keys])
         self._bias_0 = np.array([law.bias_0 for law in laws])
         covariances = np.array([factor.covariance for factor in factors])
-        self._motions = Motions(
+        self._motions = BiasedMotions(
             i_T_j=np.array([law.i_T_j for law in laws]),
             D=np.array([law.D for law in laws]),
             h=np.array([law.h for law in laws]),
@@ -160,7 +160,7 @@ OdometryWithBias.Stack = OdometryStack
 def odometry_errors(
     X_i: Floats, X_j: Floats, changes: Floats, i_T_j: Floats, D: Floats, h: Floats, whitening: Floats
 ) -> Floats:
-    """Whitened errors of n motions, shape (n, 6), from `OdometryStack._states` and `Motions`."""
+    """Whitened errors of n motions, shape (n, 6), from `OdometryStack._states` and `BiasedMotions`."""
     errors = np.empty((len(i_T_j), 6))
     for k in range(len(i_T_j)):
         e = evaluated(X_i[k], X_j[k], changes[k], i_T_j[k], D[k], h[k])[0]

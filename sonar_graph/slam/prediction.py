@@ -37,7 +37,7 @@ class Tie(NamedTuple):
         return [self.pose_key] if self.bias_key is None else [self.pose_key, self.bias_key]
 
 
-class Comparison(NamedTuple):
+class Compared(NamedTuple):
     """Innovations of m detections."""
 
     innovation: Floats
@@ -147,7 +147,7 @@ class PredictedView:
             joint[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += by_point[k] @ source.cov @ by_point[k].T
         return predicted, np.asarray(0.5 * (joint + joint.T))
 
-    def compare(self, keys: list[int], points: Floats, z: Floats, cov: Floats) -> Comparison:
+    def compare(self, keys: list[int], points: Floats, z: Floats, cov: Floats) -> Compared:
         """Detections z, shape (m, 2), with noise (m, 2, 2), of landmarks at points of the world, shape (m, 3)."""
         predicted, prior_cov = self.expect(keys, points)
         return weigh(z, predicted, prior_cov, cov)
@@ -162,7 +162,7 @@ class PredictedView:
         return cov + IDENTITY * variances[:, None]
 
 
-def weigh(z: Floats, expected: Floats, prior_cov: Floats, cov: Floats) -> Comparison:
+def weigh(z: Floats, expected: Floats, prior_cov: Floats, cov: Floats) -> Compared:
     """Compare m detections and their noise with the expectation and its covariance."""
     innovation = z - expected
     innovation[:, 1] = wrap_angle(innovation[:, 1])
@@ -172,7 +172,7 @@ def weigh(z: Floats, expected: Floats, prior_cov: Floats, cov: Floats) -> Compar
     # e' S^-1 e with the closed inverse of a 2 x 2 matrix
     distance = (c * r**2 - 2.0 * b * r * alpha + a * alpha**2) / (a * c - b**2)
     gain = np.maximum(prior_cov[:, 0, 0] / cov[:, 0, 0], prior_cov[:, 1, 1] / cov[:, 1, 1])
-    return Comparison(innovation, S, distance, gain)
+    return Compared(innovation, S, distance, gain)
 
 
 def _height_derivative(world_T_body: gtsam.Pose3, point: Floats) -> Floats:

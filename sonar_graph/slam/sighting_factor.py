@@ -62,7 +62,7 @@ class CorrelatedSighting(gtsam.CustomFactor):
         super().__init__(noise, [pose_key, landmark_key], self.law)
 
 
-class Views(NamedTuple):
+class SightingViews(NamedTuple):
     """Landmarks as n sonars see them."""
 
     world_R_sonar: Floats
@@ -123,7 +123,7 @@ class SightingStack:
             )
         ]
 
-    def _views(self, values: gtsam.Values) -> Views:
+    def _views(self, values: gtsam.Values) -> SightingViews:
         """Every sighting at these values."""
         poses = poses_of(values, self._pose_keys)
         R = poses[:, :9].reshape(-1, 3, 3)
@@ -136,7 +136,7 @@ class SightingStack:
         e = predicted - self._z
         e[:, 1] = wrap_angle(e[:, 1])
         e = times(self._whitening, e)
-        return Views(world_R_sonar, q, D_q, e, np.linalg.norm(e[self._robust], axis=1).tolist())
+        return SightingViews(world_R_sonar, q, D_q, e, np.linalg.norm(e[self._robust], axis=1).tolist())
 
 
 CorrelatedSighting.Stack = SightingStack

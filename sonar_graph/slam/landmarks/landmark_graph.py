@@ -12,7 +12,7 @@ and the journal::
     unfit, withheld ──► used later, reassigned          their place fits now
 
 The earliest sighting of a landmark has the factors that a landmark has once (`SightingFactors`). Hence the graph
-depends only on which sightings are of which landmark, and not on the order of changes (docs/theory/identities.md).
+depends only on the present landmark of each sighting, and not on the order of changes (docs/theory/identities.md).
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ UNCHANGED = Decision()
 
 
 class IdentityPolicy:
-    """Decides of which landmarks sightings are.
+    """Decides which landmark each sighting shows.
 
     For each frame `Frontend` calls `retract`, `associate`, `rivals` and `judge` in this order, then `reconsider` until
     its decision is empty. It applies each decision, and updates the estimate if that is due, before the next call.
@@ -193,7 +193,7 @@ class State(NamedTuple):
     outcome: Outcome | None = None
     """None: not judged yet."""
     landmark_id: int | None = None
-    """Landmark of which it is a sighting; None where it is not in the graph."""
+    """Landmark that it shows; None where it is not in the graph."""
     handle: int | None = None
     """Handle of its factors in the smoother; None where they wait for one, or it is not in the graph."""
 

@@ -109,12 +109,11 @@ class MixtureIdentities(IdentityPolicy):
         self._oldest_ns = 0
         """Stamp from which on sightings wait."""
         self._round = 0
-        """Number of decisions of `reconsider` since the last frame."""
+        """Number of revisions of the window since the last frame, one of them to settle the estimate."""
         self._open: list[TrackedObject] = []
         """Objects whose choices `reconsider` revises."""
-        self._solved: tuple[gtsam.Values, int] | None = None
-        """Solution from which the history was chosen, and number of sightings then."""
-        self._history: ChosenHistory | None = None
+        self._chosen: tuple[gtsam.Values, int, ChosenHistory] | None = None
+        """Solution from which the history was chosen, number of sightings then, and the history."""
 
     def screen(self, frame: LandmarkDetections) -> list[Outcome | None]:
         """Refuse second rows of tracks."""
@@ -178,26 +177,8 @@ class MixtureIdentities(IdentityPolicy):
 
     def reconsider(self) -> Decision:
         """Revise the choices of the window until none changes; then move landmarks to where their sightings agree."""
-        self._round += 1
-        if self._round == 1:
-            self._open = self._revisable()
-            if self._changes(self._open):
-                # a step of a robust kernel may end far from the minimum at which the choices are to be revised
-                return Decision(settles=True)
-            self._open = []
-        if self._round <= 1 + MOST_WINDOW_ROUNDS and self._open:
-            changes = [(each, new) for each, new in self._changes(self._open) if self._is_preferred(new, each)]
-            if changes:
-                return Decision.of(self._revised(changes))
-            self._open = []
-        while self._disputed:
-            landmark_id = min(self._disputed)
-            self._disputed.discard(landmark_id)
-            if landmark_id in self.landmarks:
-                relocated = self._relocation(landmark_id)
-                if not relocated.is_empty:
-                    return relocated
-        return UNCHANGED
+        revised = self._revise_window()
+        return self._relocate() if revised.is_empty else revised
 
     def smoothed(self) -> Solution:
         """Solution of the whole graph with the choices that suit it best."""
@@ -251,10 +232,6 @@ class MixtureIdentities(IdentityPolicy):
             if favourite is not None and favourite != new:
                 self._disputed.add(favourite)
 
-    def _revised(self, changes: Changes) -> list[Assignment]:
-        self._dispute(changes)
-        return _assigned(changes)
-
     def _changes(self, objects: list[TrackedObject]) -> Changes:
         """Best components that differ from the present choices."""
         choices = [self.landmark_of(each) for each in objects]
@@ -264,17 +241,39 @@ class MixtureIdentities(IdentityPolicy):
     def _differing(self, objects: list[TrackedObject], choices: Choices) -> Changes:
         return [(each, new) for each, new in zip(objects, choices, strict=True) if new != self.landmark_of(each)]
 
-    def _relocation(self, landmark_id: int) -> Decision:
-        """Take a landmark out of the graph, and begin it again where the objects that name it agree that it is."""
-        naming = [each for each in self.objects if each.posterior.favourite == landmark_id]
-        choices = [self.landmark_of(each) for each in naming]
-        supporters = supporters_elsewhere(landmark_id, naming, choices, self.smoother.estimates, self.mixture)
-        if supporters is None:
-            return UNCHANGED
-        leaving = _assigned([(each, None) for each in self.objects if self.landmark_of(each) == landmark_id])
-        coming = _assigned([(each, landmark_id) for each in supporters])
-        # in two rounds: a landmark begins in a new place only after it has lost its last sighting
-        return Decision((tuple(leaving), tuple(coming)))
+    def _revise_window(self) -> Decision:
+        """Next choices in the window; empty when none changes, and after `MOST_WINDOW_ROUNDS`."""
+        self._round += 1
+        if self._round == 1:
+            self._open = self._revisable()
+        if self._round > 1 + MOST_WINDOW_ROUNDS:
+            self._open = []
+        changes = self._changes(self._open)
+        if changes and self._round == 1:
+            # a step of a robust kernel may end far from the minimum at which the choices are to be revised
+            return Decision(settles=True)
+        preferred = [(each, new) for each, new in changes if self._is_preferred(new, each)]
+        if not preferred:
+            self._open = []
+        self._dispute(preferred)
+        return Decision.of(_assigned(preferred))
+
+    def _relocate(self) -> Decision:
+        """Begin the next disputed landmark again where the objects that name it agree that it is."""
+        while self._disputed:
+            landmark_id = min(self._disputed)
+            self._disputed.discard(landmark_id)
+            if landmark_id not in self.landmarks:
+                continue
+            naming = [each for each in self.objects if each.posterior.favourite == landmark_id]
+            choices = [self.landmark_of(each) for each in naming]
+            supporters = supporters_elsewhere(landmark_id, naming, choices, self.smoother.estimates, self.mixture)
+            if supporters is not None:
+                leaving = _assigned([(each, None) for each in self.objects if self.landmark_of(each) == landmark_id])
+                coming = _assigned([(each, landmark_id) for each in supporters])
+                # in two rounds: a landmark begins in a new place only after it has lost its last sighting
+                return Decision((tuple(leaving), tuple(coming)))
+        return UNCHANGED
 
     def _revisable(self) -> list[TrackedObject]:
         """Objects whose choices are revised: tracks whose posterior contradicts it, and objects in the window.
@@ -326,10 +325,9 @@ class MixtureIdentities(IdentityPolicy):
         """Revise the choices of the whole history until none changes. The run's own choices stay."""
         solved, marginals = self.smoother.solve_history()
         count = sum(len(each.sightings) for each in self.objects)
-        if self._history is None or self._solved is None or self._solved[0] is not solved or self._solved[1] != count:
-            self._history = self._choose_history(solved, marginals)
-            self._solved = (solved, count)
-        return self._history
+        if self._chosen is None or self._chosen[0] is not solved or self._chosen[1] != count:
+            self._chosen = (solved, count, self._choose_history(solved, marginals))
+        return self._chosen[2]
 
     def _choose_history(self, solved: gtsam.Values, marginals: Marginals) -> ChosenHistory:
         objects = [each for each in self.objects if not self._is_withheld(each)]

@@ -52,7 +52,7 @@ class TrackedIdentity(Section):
 
     @property
     def gate(self) -> float:
-        """Largest squared Mahalanobis distance of range and azimuth; infinite: none is refused."""
+        """Largest squared Mahalanobis distance of range and azimuth; infinite: no gate."""
         return math.inf
 
 
@@ -92,7 +92,7 @@ class GatedIdentity(TrackedIdentity):
 
     @property
     def gate(self) -> float:
-        """Largest squared Mahalanobis distance of range and azimuth; infinite: none is refused."""
+        """Largest squared Mahalanobis distance of range and azimuth; infinite: no gate."""
         return gate_threshold(self.gate_probability, 2) if self.gate_probability < 1 else math.inf
 
 

@@ -129,7 +129,7 @@ class NamelessLandmarks(IdentityPolicy):
         self._longest_wait_s = max(min(params.longest_wait_s, self.smoother.params.lag_s - ROUNDING_S), 0.0)
         self._candidates: list[Candidate] = []
         self._grown: list[Candidate] = []
-        """Candidates of which the last frame has a sighting."""
+        """Candidates that the last frame shows."""
         self._next_id = FIRST_ANONYMOUS_ID
 
     def refuse_taken_ids(self, frame: LandmarkDetections) -> None:
