@@ -159,8 +159,8 @@ def dlr(data: Path | None) -> Sequence:
 
 def stpere(data: Path | None) -> Sequence:
     """Vehicle in a marina, with headings and without landmarks."""
-    with recording(data, "stpere.tar.xz", "stpere") as folder:
-        return read_stpere(folder)
+    with recording(data, "stpere.tar.xz", "DVL.log") as table:  # the archive holds files without a folder
+        return read_stpere(table.parent)
 
 
 LOGS: dict[str, GoldenLog] = {
