@@ -283,8 +283,8 @@ def keep_run(sequence: Sequence, place: Place, seconds: float) -> None:
     text = json.dumps(summary, indent=1)
     write_whole(place.summary, lambda path: path.write_text(text, "utf-8"))  # last: it marks the run as kept
     rms = summary.get("causal_rms_m")
-    rms_text = "" if rms is None else f", causal rms {rms:.3f} m"
-    note(f"{place.log} {place.estimator}: {run.status} {run.reason}{rms_text}, {summary['processor_s']:.1f} s")
+    result = run.reason if rms is None else f"causal rms {rms:.3f} m"
+    note(f"{place.log} {place.estimator}: {run.status} after {summary['processor_s']:.1f} s {result}")
 
 
 def arrays_of(run: RunResult) -> dict[str, Any]:
