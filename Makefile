@@ -3,6 +3,7 @@
 # make test-slow, make test-thorough   the slow tests; every property with many examples
 # make check   lint, format, types, import contracts
 # make bench-page   estimators and rules of others on recordings and basins, hours; SONAR_GRAPH_DATA=folder of recordings
+# make bench-speed   ratios of speed beside the accepted ones, 5 minutes; ARGS=--accept accepts the measured ones
 # make docs    the documentation as a site, in build/site: pages to open in a browser, without a network
 # PYTHON=python3.13 chooses the interpreter, VENV=folder the environment.
 
@@ -13,7 +14,7 @@ BENCH ?= bench
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: bench-page demo docs test test-slow test-thorough check format wheel check-wheel install clean
+.PHONY: bench-page bench-speed demo docs test test-slow test-thorough check format wheel check-wheel install clean
 
 demo: $(VENV)/.installed
 	$(BIN)/sonar-graph demo -o $(DEMO)
@@ -51,6 +52,10 @@ format: $(VENV)/.installed-lint
 bench-page: $(VENV)/.installed
 	$(PIP) --editable '.[bench]' --editable benchmarks/published_rules
 	$(BIN)/sonar-graph bench benchmarks/suites/open.toml -o $(BENCH)
+
+# Ratios of times from scripts in which both sides take turns. ARGS: --quick, --rounds 3, --accept
+bench-speed: $(VENV)/.installed-tests
+	$(BIN)/python benchmarks/performance/speed.py $(ARGS)
 
 wheel: $(BIN)/python
 	rm -rf dist

@@ -15,6 +15,8 @@ import pytest
 
 import sonar_graph
 
+from .import_circles import SourceFiles, shortest_circle, tangles
+
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("sonar_graph", "baselines")
 FILES = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
@@ -65,6 +67,46 @@ def test_a_package_is_a_short_table_of_contents_with_few_modules(path: Path) -> 
     if path.parent != ROOT / "sonar_graph":
         assert path.read_text("utf-8").count("\n") <= 30
     assert len([p for p in path.parent.glob("*.py") if p.name != "__init__.py"]) <= 13
+
+
+# Sets of files that import each other. None is left: a new one is a fault, so this list stays empty.
+KNOWN_TANGLES: list[set[str]] = []
+# Folders of which each imports files of the other. The list may only become shorter.
+KNOWN_MUTUAL_FOLDERS = {
+    ("sonar_graph/logs", "sonar_graph/logs/adapters"),
+    ("sonar_graph/navigation", "sonar_graph/navigation/alignment"),
+    ("sonar_graph/navigation", "sonar_graph/navigation/dvl_screening"),
+    ("sonar_graph/report", "sonar_graph/report/figures"),
+    ("sonar_graph/simulation", "sonar_graph/simulation/sonar_image"),
+    ("sonar_graph/slam", "sonar_graph/slam/landmarks"),
+}
+
+
+@pytest.fixture(scope="module")
+def source() -> SourceFiles:
+    return SourceFiles(ROOT, PACKAGES)
+
+
+def test_no_files_import_each_other_in_a_circle(source: SourceFiles) -> None:
+    found = tangles(source.imports)
+    new = [tangle for tangle in found if {source.shown(path) for path in tangle} not in KNOWN_TANGLES]
+    circles = [" -> ".join(map(source.shown, shortest_circle(source.imports, tangle))) for tangle in new]
+    assert not circles, "\n".join(circles)
+    assert len(KNOWN_TANGLES) == len(found), "a circle is gone: remove it from KNOWN_TANGLES"
+
+
+def test_no_further_folders_import_each_other(source: SourceFiles) -> None:
+    examples: dict[tuple[str, str], str] = {}
+    for path, targets in source.imports.items():
+        for target in targets:
+            folders = (source.shown(path.parent), source.shown(target.parent))
+            # A table of contents lists files of folders below, and everything may use the files of the root.
+            if path.name != "__init__.py" and folders[0] != folders[1] and "sonar_graph" not in folders:
+                examples[folders] = f"{source.shown(path)} -> {source.shown(target)}"
+    mutual = {pair for pair in examples if pair[::-1] in examples and pair[0] < pair[1]}
+    new = [f"{examples[pair]}, {examples[pair[::-1]]}" for pair in sorted(mutual - KNOWN_MUTUAL_FOLDERS)]
+    assert not new, "\n".join(new)
+    assert not KNOWN_MUTUAL_FOLDERS - mutual, "these import each other no more: remove them from the list"
 
 
 def test_names_of_files_and_of_public_classes_occur_once() -> None:

@@ -252,6 +252,8 @@ def report(result: Race) -> dict[str, float | int | bool]:
         "plain_error_m": result.error_m["plain"],
         "frames": len(ours.cpu_s),
     }
+    plain_p99_ms = float(np.quantile(np.array(plain.cpu_s) * 1e3, 0.99))
+    figures["p99_ratio"] = figures["p99_cpu_ms"] / plain_p99_ms
     figures["passed"] = all(figures[name] <= limit for name, limit in TARGETS.items())
     return figures
 
