@@ -55,10 +55,13 @@ from sonar_graph.slam.sighting_factor import poses_of
 UNIT = gtsam.noiseModel.Unit.Create(6)
 
 
+UNWHITENED = np.eye(6)[None]
+
+
 class OdometryError:
     """Error of one factor, called by GTSAM."""
 
-    __slots__ = ("D", "bias_0", "h", "i_T_j", "keys")
+    __slots__ = ("D", "_R", "_motion", "_p", "_poses", "bias_0", "h", "i_T_j", "keys")
 
     def __init__(self, keys: tuple[int, int, int], motion: PreintegratedMotion, up_j: Floats) -> None:
         self.keys = keys
@@ -68,20 +71,27 @@ class OdometryError:
         self.h[HEADING] = up_j @ motion.D_bias[:3, HEADING]
         self.D = motion.D_bias.copy()
         self.D[:3] -= np.outer(up_j, self.h)
+        self._motion = (self.i_T_j[None], self.D[None], self.h[None], UNWHITENED)
+        # GTSAM asks thousands of times: poses are written into arrays made once
+        self._poses = np.empty((2, 1, 12))
+        self._R = self._poses[:, 0, :9].reshape(2, 3, 3)
+        self._p = self._poses[:, 0, 9:]
 
     def __call__(self, _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:
         """Error, shape (6,), unwhitened."""
-        i, j, bias_key = self.keys
-        X_i = pose_row(values.atPose3(i))[None]
-        X_j = pose_row(values.atPose3(j))[None]
-        change = (values.atVector(bias_key) - self.bias_0)[None]
-        motion = (self.i_T_j[None], self.D[None], self.h[None], np.eye(6)[None])
+        for k in range(2):
+            world_T_body = values.atPose3(self.keys[k]).matrix()  # (4, 4)
+            self._R[k] = world_T_body[:3, :3]
+            self._p[k] = world_T_body[:3, 3]
+        X_i, X_j = self._poses
+        change = (values.atVector(self.keys[2]) - self.bias_0)[None]
         if jacobians is None:
-            return odometry_errors(X_i, X_j, change, *motion)[0]
-        (e,), *columns = odometry_derivatives(X_i, X_j, change, *motion)
-        for k, (transposed,) in enumerate(columns):
-            jacobians[k] = transposed.T
-        return np.asarray(e)
+            return odometry_errors(X_i, X_j, change, *self._motion)[0]
+        e, by_i, by_j, by_b = odometry_derivatives(X_i, X_j, change, *self._motion)
+        jacobians[0] = by_i[0].T
+        jacobians[1] = by_j[0].T
+        jacobians[2] = by_b[0].T
+        return np.asarray(e[0])
 
 
 class OdometryWithBias(gtsam.CustomFactor):

@@ -10,16 +10,15 @@ from sonar_graph.slam.smoother import Marginals, Smoother, batch_solution
 from sonar_graph.slam.smoother.batch_solution import (
     Sightline,
     Sightlines,
-    StackedGraph,
     misplaced,
-    placed_anew,
+    placed_again,
     solve,
     solve_in_sight,
 )
 
 from .fed import FOREVER_S, SONAR, in_the_basin
 from .graphs import gtsams_solution
-from .made import cauchy, graph_of, huber, isotropic, plain, pose_prior, scattered, smoother_with, values_of
+from .made import cauchy, graph_of, huber, plain, pose_prior, scattered, smoother_with, values_of
 
 
 def round_trip(seed: int, kernel=plain) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
@@ -161,7 +160,7 @@ def test_a_landmark_is_turned_away_where_at_least_half_of_its_sightings_have_it_
 
 
 def test_a_landmark_is_placed_where_most_of_its_sightings_say():
-    placed = placed_anew(values_of(X0=POSE, L1=np.zeros(3)), seen(Z, Z, np.array([9.0, -1.0])), [L(1)])
+    placed = placed_again(values_of(X0=POSE, L1=np.zeros(3)), seen(Z, Z, np.array([9.0, -1.0])), [L(1)])
     assert placed.atPoint3(L(1)) == pytest.approx(world_point(*Z))
     assert placed.atPose3(X(0)).equals(POSE, 1e-12)
 
@@ -198,7 +197,7 @@ def test_a_new_start_that_ends_higher_is_not_taken():
     smoother = smoother_at(world_point(*Z), (Z, 1e-3), (opposite, 0.3), (opposite, 0.3))
     lines = seen(Z, opposite, opposite)
     assert misplaced(smoother.values, lines) == [L(1)]
-    elsewhere = solve(smoother.graph, placed_anew(smoother.values, lines, [L(1)]))
+    elsewhere = solve(smoother.graph, placed_again(smoother.values, lines, [L(1)]))
     values, _ = smoother.solve_history()
     assert np.linalg.norm(elsewhere.atPoint3(L(1)) - world_point(*Z)) > 1.0
     assert np.linalg.norm(values.atPoint3(L(1)) - world_point(*Z)) < 0.01
@@ -210,7 +209,7 @@ def test_a_solution_tries_no_more_steps_than_two_descents_may(most, monkeypatch)
     """Sightlines astern of a sonar that looks ahead: landmarks stay behind, and each new start ends lower."""
     tried = []
     step = batch_solution.damped_step
-    monkeypatch.setattr(batch_solution, "placed_anew", lambda values, *_: values)
+    monkeypatch.setattr(batch_solution, "placed_again", lambda values, *_: values)
     monkeypatch.setattr(batch_solution, "damped_step", lambda *given: tried.append(1) or step(*given))
     graph, initial = round_trip(1)
     astern = [Sightline(X(k), SONAR, np.array([2.0, np.pi])) for k in range(12)]
@@ -222,43 +221,3 @@ def test_a_solution_tries_no_more_steps_than_two_descents_may(most, monkeypatch)
     bounded = solve_in_sight(graph, initial, lines)
     assert most <= len(tried) <= 2 * most < needed
     assert graph.error(freely) < graph.error(bounded) < graph.error(initial)
-
-
-def test_what_is_held_stays_while_the_rest_is_solved_for():
-    """A prior would move it by a metre."""
-    step = gtsam.Pose3(gtsam.Rot3.Rz(0.1), np.array([1.0, 0.0, 0.0]))
-    graph = graph_of([pose_prior(X(0), step, 0.1), gtsam.BetweenFactorPose3(X(0), X(1), step, isotropic(6, 0.1))])
-    found = batch_solution.descended(graph, values_of(X0=gtsam.Pose3(), X1=gtsam.Pose3()), 20, [X(0)])[0]
-    assert found.atPose3(X(0)).equals(gtsam.Pose3(), 1e-6)
-    assert found.atPose3(X(1)).equals(step, 1e-6)
-
-
-def test_what_still_moves_is_solved_for_by_itself_to_the_same_solution(monkeypatch: pytest.MonkeyPatch):
-    """One keyframe of forty starts far off; of the others none moves while it is solved for."""
-    step, noise = gtsam.Pose3(gtsam.Rot3.Rz(0.1), np.array([1.0, 0.0, 0.0])), isotropic(6, 0.1)
-    graph, values, pose = graph_of([pose_prior(X(0), gtsam.Pose3(), 0.1)]), gtsam.Values(), gtsam.Pose3()
-    for k in range(40):
-        values.insert(X(k), pose)
-        pose = pose.compose(step)
-        if k:
-            graph.add(gtsam.BetweenFactorPose3(X(k - 1), X(k), step, noise))
-    values.update(X(20), values.atPose3(X(20)).compose(gtsam.Pose3(gtsam.Rot3.Rz(1.5), np.array([2.0, 1.0, 0.0]))))
-    around, parts = StackedGraph.around, []
-
-    def watched(stacked: StackedGraph, keyframes: list[int], at: gtsam.Values):
-        part, some = around(stacked, keyframes, at)
-        held = [key for key in list(some.keys()) if key not in keyframes]
-        solved = batch_solution.descended(part, some, 20, held)[0]
-        assert held
-        assert all(solved.atPose3(key).equals(some.atPose3(key), 1e-6) for key in held)
-        parts.append(keyframes)
-        return part, some
-
-    monkeypatch.setattr(StackedGraph, "around", watched)
-    found = solve(graph, values)
-    assert X(20) in parts[0]
-    assert len(parts[0]) < 10
-    monkeypatch.setattr(batch_solution, "FEW", 0.0)
-    parts.clear()
-    assert found.equals(solve(graph, values), 1e-5)
-    assert not parts

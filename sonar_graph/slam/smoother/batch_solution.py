@@ -12,17 +12,16 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import gtsam
 import numpy as np
 
 from sonar_graph.measurements import Floats
 from sonar_graph.models import project, wrap_angle
-from sonar_graph.slam.smoother.variables import Known, is_pose, picked, tangent_size
+from sonar_graph.slam.smoother.variables import Known, picked, tangent_size
 
 MAX_STEPS = 50
 """Steps that a descent may try, whether or not they lower the error: each costs a factorisation of the graph."""
@@ -33,14 +32,6 @@ LEAST_DECREASE = 1e-5
 FIRST_DAMPING = 1e-9
 DAMPING_FACTOR = 10.0
 MAX_DAMPING = 1e9
-MOVING = 0.1
-"""Share of the largest move of a keyframe in a step from which on another one moves much."""
-FEW = 0.4
-"""Share of keyframes up to which they are solved for by themselves."""
-MAX_STEPS_OF_PART = 20
-"""Steps that the solution of a part may try by itself. Its own parts may begin until they have tried `MAX_STEPS`."""
-HELD = 1e-6
-"""Standard deviation of what is held meanwhile, rad or m."""
 
 
 class Stack(Protocol):
@@ -80,107 +71,87 @@ class StackedGraph:
             linear.push_back(factor)
         return linear
 
-    @cached_property
-    def _on(self) -> dict[int, list[int]]:
-        """Places of the factors on each keyframe."""
-        places = defaultdict(list)
-        for i, factor in enumerate(self.factors):
-            for key in filter(is_pose, list(factor.keys())):
-                places[key].append(i)
-        return places
-
-    def unsettled(self, step: gtsam.VectorValues) -> list[int]:
-        """Keyframes that a step moves at least a tenth as far as the one that it moves most, where these are few."""
-        keyframes = list(self._on)
-        moves = np.abs(step.vector(keyframes)).reshape(-1, 6).max(axis=1, initial=0.0)
-        found = np.flatnonzero(moves > MOVING * moves.max(initial=0.0)).tolist()
-        return [keyframes[i] for i in found] if len(found) < FEW * len(moves) else []
-
-    def around(self, keyframes: list[int], values: gtsam.Values) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-        """Factors on some keyframes, and the values of their variables."""
-        part = gtsam.NonlinearFactorGraph()
-        for i in sorted({i for key in keyframes for i in self._on[key]}):
-            part.add(self.factors[i])
-        return part, picked(values, list(part.keyVector()))
-
 
 def solve(graph: gtsam.NonlinearFactorGraph, initial: gtsam.Values) -> gtsam.Values:
-    """Solution by Levenberg–Marquardt; the initial values where no step lowers the error."""
-    return descended(graph, initial, MAX_STEPS)[0]
+    """Solution by Levenberg-Marquardt; the initial values where no step lowers the error."""
+    return descended(graph, initial, MAX_STEPS).values
 
 
-def descended(
-    graph: gtsam.NonlinearFactorGraph,
-    initial: gtsam.Values,
-    most_steps: int,
-    held: Collection[int] = (),
-) -> tuple[gtsam.Values, float, int]:
-    """Levenberg–Marquardt from ``initial``, in at most so many steps.
+class Descent(NamedTuple):
+    """Result of a descent."""
 
-    Minimises the sum of squared whitened (and robustly weighted) errors. Damping multiplies the identity; it starts
-    negligible (a Gauss–Newton step) and grows, by 10, 100, 1000 and so on, while a step does not lower the error
-    (Nocedal and Wright, Numerical Optimization, section 10.3). A step is doubled while that lowers the error more:
-    those of a robust kernel fall short, since its weights are held while a step is solved for. After a step by
-    which few keyframes move much these are solved for in the same way, with all else held, before the next step of all.
+    values: gtsam.Values
+    error: float
+    """Half the sum of squared whitened errors, robustly weighted."""
+    steps: int
+    """Number of steps that were tried."""
 
-    Parameters
-    ----------
-    held
-        Variables that stay where they are.
 
-    Returns
-    -------
-    The values reached, their error, and the number of steps that were tried; those of parts count where something is
-    held.
+def descended(graph: gtsam.NonlinearFactorGraph, initial: gtsam.Values, most_steps: int) -> Descent:
+    """Levenberg-Marquardt from initial values, in at most so many steps.
+
+    Damping multiplies the identity. It starts negligible (a Gauss-Newton step) and grows, by 10, 100, 1000 and so on,
+    while a step does not lower the error (Nocedal and Wright, Numerical Optimization, section 10.3). A step is doubled
+    while that lowers the error further: steps of a robust kernel are too short, since its weights are held while a step
+    is solved for. Doubling halves the time of a graph with many robust factors, such as DLR's.
     """
     stacked = StackedGraph(graph)
-    values, error = initial, stacked.error(initial)
-    damping, ordering, tried, in_parts = FIRST_DAMPING, None, 0, 0
-    priors, still = [prior_of(key, 1 / HELD) for key in held], gtsam.VectorValues()
-    for key in held:
-        still.insert(key, np.zeros(tangent_size(key)))
+    values = initial
+    error = stacked.error(initial)
+    damping = FIRST_DAMPING
+    ordering = None
+    tried = 0
     while tried < most_steps:
         linear = stacked.linearize(values)
-        for prior in priors:
-            linear.push_back(prior)
         if ordering is None:
             ordering = gtsam.Ordering.ColamdGaussianFactorGraph(linear)
-        candidate, candidate_error, factor = values, np.inf, DAMPING_FACTOR
-        while damping <= MAX_DAMPING and tried < most_steps:
+        step = None
+        growth = DAMPING_FACTOR
+        while step is None and damping <= MAX_DAMPING and tried < most_steps:
             tried += 1
-            try:
-                step = damped_step(linear, values, damping, ordering)
-                step.update(still)  # doubled again and again the least move would add up
-                candidate = values.retract(step)
-                candidate_error = stacked.error(candidate)
-            except RuntimeError:  # GTSAM: indeterminate for this damping
-                candidate_error = np.inf
-            if candidate_error < error:
-                break
-            damping, factor = damping * factor, factor * DAMPING_FACTOR
-        else:
+            step = lowering_step(stacked, linear, values, error, damping, ordering)
+            if step is None:
+                damping *= growth
+                growth *= DAMPING_FACTOR
+        if step is None:
             break
         damping = max(damping / DAMPING_FACTOR, FIRST_DAMPING)
-        while True:  # weights that are made anew with each step make steps too short
-            step = step.scale(2.0)
-            further = values.retract(step)
-            further_error = stacked.error(further)
-            if not further_error < candidate_error:
-                break
-            candidate, candidate_error = further, further_error
-        decrease = error - candidate_error
-        values, error = candidate, candidate_error
-        if decrease <= max(RELATIVE_DECREASE * error, LEAST_DECREASE):
+        before = error
+        values, error = doubled(stacked, values, step)
+        if before - error <= max(RELATIVE_DECREASE * error, LEAST_DECREASE):
             break
-        if (not held or in_parts < MAX_STEPS) and (moving := stacked.unsettled(step)):
-            part, some = stacked.around(moving, values)
-            rest = set(some.keys()).difference(moving)
-            some, _, steps = descended(part, some, MAX_STEPS_OF_PART, rest)
-            in_parts += steps
-            values = gtsam.Values(values)
-            values.update(picked(some, moving))
-            error = stacked.error(values)
-    return values, error, tried + in_parts if held else tried
+    return Descent(values, error, tried)
+
+
+def lowering_step(
+    stacked: StackedGraph,
+    linear: gtsam.GaussianFactorGraph,
+    values: gtsam.Values,
+    error: float,
+    damping: float,
+    ordering: gtsam.Ordering,
+) -> gtsam.VectorValues | None:
+    """Damped step, if it lowers the error of the graph; else None."""
+    try:
+        step = damped_step(linear, values, damping, ordering)
+        is_lower = stacked.error(values.retract(step)) < error
+    except RuntimeError:  # GTSAM: indeterminate for this damping
+        return None
+    return step if is_lower else None
+
+
+def doubled(stacked: StackedGraph, values: gtsam.Values, step: gtsam.VectorValues) -> tuple[gtsam.Values, float]:
+    """Values after a step, doubled while that lowers the error, and their error."""
+    reached = values.retract(step)
+    error = stacked.error(reached)
+    while True:
+        step = step.scale(2.0)
+        further = values.retract(step)
+        further_error = stacked.error(further)
+        if not further_error < error:
+            return reached, error
+        reached = further
+        error = further_error
 
 
 def prior_of(key: int, weight: float) -> gtsam.JacobianFactor:
@@ -279,7 +250,7 @@ def misplaced(values: gtsam.Values, sightlines: Sightlines) -> list[int]:
     return found
 
 
-def placed_anew(values: gtsam.Values, sightlines: Sightlines, landmark_keys: list[int]) -> gtsam.Values:
+def placed_again(values: gtsam.Values, sightlines: Sightlines, landmark_keys: list[int]) -> gtsam.Values:
     """The values, with each of the landmarks at the median of where its sightings, from these poses, say it is."""
     placed = gtsam.Values(values)
     for key in landmark_keys:
@@ -288,16 +259,20 @@ def placed_anew(values: gtsam.Values, sightlines: Sightlines, landmark_keys: lis
 
 
 def solve_in_sight(graph: gtsam.NonlinearFactorGraph, initial: gtsam.Values, sightlines: Sightlines) -> gtsam.Values:
-    """Solve a graph; again while a landmark is misplaced and its new start lowers the error.
+    """Solve a graph; solve it again while landmarks are misplaced and new starts for them lower the error.
 
-    All that begins anew may try `MAX_STEPS` together, so that a graph whose measurements contradict each other, where
-    landmarks stay misplaced, costs twice what one descent may.
+    The repeated descents may try `MAX_STEPS` together, so that a graph whose measurements contradict each other, where
+    landmarks stay misplaced, costs at most twice as much as one descent.
     """
-    (values, error, _), left = descended(graph, initial, MAX_STEPS), MAX_STEPS
-    while left and (stuck := misplaced(values, sightlines)):
-        retried, lower, tried = descended(graph, placed_anew(values, sightlines, stuck), left)
-        left -= tried
-        if lower >= error:
+    best = descended(graph, initial, MAX_STEPS)
+    steps_left = MAX_STEPS
+    while steps_left:
+        stuck = misplaced(best.values, sightlines)
+        if not stuck:
             break
-        values, error = retried, lower
-    return values
+        retried = descended(graph, placed_again(best.values, sightlines, stuck), steps_left)
+        steps_left -= retried.steps
+        if retried.error >= best.error:
+            break
+        best = retried
+    return best.values
