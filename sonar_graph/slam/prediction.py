@@ -17,6 +17,7 @@ import numpy as np
 from sonar_graph.measurements import Floats
 from sonar_graph.models import view_points, wrap_angle
 from sonar_graph.motion import PreintegratedMotion
+from sonar_graph.numerics import cross_matrix
 from sonar_graph.slam.smoother import JointCovariance
 
 IDENTITY = np.eye(2)
@@ -96,17 +97,24 @@ class PredictedView:
             # the biases bend the motion, whose perturbation is that of the body at the frame
             self._by_state[:, row : row + len(motion.bias)] = self._by_body @ motion.D_bias
 
-    def height_variance(self, point: Floats) -> float:
-        """Variance of the world z of a point fixed to the body at the frame, shape (3,) in the world, m².
+    def height_variances(self, points: Floats) -> Floats:
+        """Variance of the world z of points fixed to the body at the frame, shape (m,), m².
 
         Keyframe and motion count. The gyro bias is left out: it turns mostly about the vertical.
+
+        Parameters
+        ----------
+        points
+            In the world, shape (m, 3).
         """
         row = self._pose_row
         P = self._covariance.matrix[row : row + 6, row : row + 6]
         Q = self._motion.covariance
-        by_keyframe = _height_derivative(self._world_T_keyframe, point)
-        by_body = _height_derivative(self._world_T_keyframe.compose(self._motion.i_T_j), point)
-        return float(by_keyframe @ P @ by_keyframe + by_body @ Q @ by_body)
+        by_keyframe = _height_derivatives(self._world_T_keyframe, points)  # (m, 6)
+        by_body = _height_derivatives(self._world_T_keyframe.compose(self._motion.i_T_j), points)
+        from_keyframe = np.vecdot(by_keyframe @ P, by_keyframe)
+        from_motion = np.vecdot(by_body @ Q, by_body)
+        return np.asarray(from_keyframe + from_motion)
 
     def expect(self, keys: list[int], points: Floats) -> tuple[Floats, Floats]:
         """Expected range and azimuth of landmarks at points of the world, shape (m, 3).
@@ -175,8 +183,12 @@ def weigh(z: Floats, expected: Floats, prior_cov: Floats, cov: Floats) -> Compar
     return Compared(innovation, S, distance, gain)
 
 
-def _height_derivative(world_T_body: gtsam.Pose3, point: Floats) -> Floats:
-    """Derivative of the world z of a point of the body by the right perturbation of its pose, shape (6,)."""
-    up = world_T_body.rotation().matrix()[2]
-    q = world_T_body.transformTo(point)
-    return np.concatenate((np.cross(q, up), up))
+def _height_derivatives(world_T_body: gtsam.Pose3, points: Floats) -> Floats:
+    """Derivatives of the world z of points of the body by the right perturbation of its pose, shape (m, 6)."""
+    world_R_body = world_T_body.rotation().matrix()
+    up = world_R_body[2]
+    q = (points - world_T_body.translation()) @ world_R_body  # body axes, (m, 3)
+    derivatives = np.empty((len(points), 6))
+    derivatives[:, :3] = q @ cross_matrix(up)  # q x up
+    derivatives[:, 3:] = up
+    return derivatives

@@ -196,7 +196,7 @@ def test_the_variance_of_a_height_is_that_of_keyframe_and_motion(keyframe):
 
     J = central_differences(z, np.zeros(12))
     expected = J[:6] @ joint.at(X(2), X(2)) @ J[:6] + J[6:] @ motion.covariance @ J[6:]
-    assert view.height_variance(body.transformFrom(q)) == pytest.approx(expected, rel=1e-6)
+    assert view.height_variances(body.transformFrom(q)[None])[0] == pytest.approx(expected, rel=1e-6)
 
 
 @keyframes

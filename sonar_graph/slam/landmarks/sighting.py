@@ -142,8 +142,12 @@ class SeenFrame:
 
     def beam_points(self, rows: list[int]) -> Floats:
         """Points of the world at the measured range and azimuth and elevation 0, shape (len(rows), 3), m."""
-        located = [locate(self.view.world_T_sonar, r, a, 0.0) for r, a in self.frame.z[rows].tolist()]
-        return np.array(located).reshape(-1, 3)
+        ranges_m, azimuths_rad = self.frame.z[rows].T
+        on_beam = np.zeros((len(rows), 3))  # sonar axes
+        on_beam[:, 0] = ranges_m * np.cos(azimuths_rad)
+        on_beam[:, 1] = ranges_m * np.sin(azimuths_rad)
+        world_T_sonar = self.view.world_T_sonar
+        return np.asarray(on_beam @ world_T_sonar.rotation().matrix().T + world_T_sonar.translation())
 
     def sightings(self, rows: list[int], points: Floats, elevation_rad: float = 0.0) -> list[Sighting]:
         """Sightings of some detections.
@@ -167,23 +171,24 @@ class SeenFrame:
                 row=frame.rows[row],
                 line=Sightline(self.tie.pose_key, keyframe_T_sonar, frame.z[row]),
                 noise=R,
-                floor=self.floor_under(row),
+                floor=floor,
                 elevation_rad=elevation_rad,
             )
-            for row, R in zip(rows, noise, strict=True)
+            for row, R, floor in zip(rows, noise, self.floors_under(rows), strict=True)
         ]
 
-    def floor_under(self, row: int) -> FloorPrior | None:
-        """Known floor, or None where it is too far from the point on the centre beam (`FLOOR_GATE`)."""
+    def floors_under(self, rows: list[int]) -> list[FloorPrior | None]:
+        """Known floor of each detection; None where it is too far from the point on the centre beam (`FLOOR_GATE`)."""
         floor = self.factors.floor
         if floor is None:
-            return None
-        (point,) = self.beam_points([row])
+            return [None] * len(rows)
+        points = self.beam_points(rows)
         # an elevation of e raises the point by e times the range along the sonar's z axis
-        slope_m = self.frame.z[row, 0] * self.view.world_T_sonar.rotation().matrix()[2, 2]
-        by_elevation = (slope_m * self.factors.elevation_sigma_rad) ** 2
-        variance = by_elevation + self.view.height_variance(point) + floor.sigma_m**2
-        return floor if (point[2] - floor.z_m) ** 2 <= FLOOR_GATE * variance else None
+        slope_m = self.frame.z[rows, 0] * self.view.world_T_sonar.rotation().matrix()[2, 2]
+        by_elevation = np.square(slope_m * self.factors.elevation_sigma_rad)
+        variance = by_elevation + self.view.height_variances(points) + floor.sigma_m**2
+        is_on_floor = np.square(points[:, 2] - floor.z_m) <= FLOOR_GATE * variance
+        return [floor if is_on else None for is_on in is_on_floor.tolist()]
 
 
 def late_view(sighting: Sighting, values: Known, joint: JointCovariance) -> PredictedView:

@@ -334,7 +334,7 @@ class TrackedIdentities(IdentityPolicy):
         """Begin a landmark, on the known floor where it can stand on it, else on the centre beam."""
         frame = seen.frame
         z = frame.z[row]
-        elevation_rad = seen.factors.elevation_on(seen.floor_under(row), seen.view.world_T_sonar, z)
+        elevation_rad = seen.factors.elevation_on(seen.floors_under([row])[0], seen.view.world_T_sonar, z)
         start = locate(seen.view.world_T_sonar, z[0], z[1], elevation_rad)
         # as in `_compared`: of a track, the sighting must not depend on where this landmark begins
         if frame.detections.track[row] == NO_TRACK:
