@@ -132,7 +132,8 @@ class Isam2:
         require_noise(calibration)
         self._params: Isam2Params = params or Isam2Params()
         self._poses = PoseHistory()
-        self._smoother = Smoother(self._params.smoother, self._params.history, self._poses)
+        range_sigma_m = calibration.sonar.range_sigma_m
+        self._smoother = Smoother(self._params.smoother, self._params.history, self._poses, range_sigma_m)
         self._keyframes = Keyframes(calibration, odometry, self._params.keyframes, self._smoother)
         self._frontend = Frontend(self._params.identity, self._params.kernel, self._keyframes)
 

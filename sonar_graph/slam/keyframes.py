@@ -51,6 +51,9 @@ LONGEST_LATE_S = 60.0
 FIX_GAIN = 50.0
 """Weight of the expected information of a fix beside that of a sighting: with the default ``waiting_gain`` of 5, fixes
 wait for the next keyframe unless together they would cut the position variance by more than 10 %."""
+LEAST_BIAS_SHARE = 0.01
+"""Variance of a fix from the biases of the motion to it, as a share of its noise, from which the fix constrains the
+biases too. Gaps exceed it. Below it a factor on the keyframe alone is used, which is compiled."""
 EARLIEST_NS = np.iinfo(np.int64).min
 LATEST_NS = np.iinfo(np.int64).max
 
@@ -559,7 +562,8 @@ class Keyframes:
         by_motion = world_R_fix @ np.hstack((-cross_matrix(antenna), np.eye(3)))
         noise_m2 = cov_m2 + by_motion @ motion.covariance @ by_motion.T
         factor: gtsam.NonlinearFactor
-        if self._has_motion_biases:
+        by_biases_m2 = np.square(by_motion @ motion.D_bias) @ np.square(self._bias_sigmas)  # (3,)
+        if (by_biases_m2 > LEAST_BIAS_SHARE * noise_m2.diagonal()).any():
             keys = (X(i), self.bias_keys[i])
             factor = factors.position_with_biases(keys, position_m, motion, antenna, noise_m2)
         else:

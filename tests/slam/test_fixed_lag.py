@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from sonar_graph.slam.smoother import Sightline
 from sonar_graph.slam.smoother.factor_store import FactorGroup, FactorStore
-from sonar_graph.slam.smoother.window import FixedLagWindow, marginal
+from sonar_graph.slam.smoother.window import FixedLagWindow, Thresholds, marginal
 
 from .graphs import factors_of
 from .made import graph_of, isotropic, point_prior, pose_prior, values_of
@@ -57,7 +57,7 @@ def test_a_window_counts_factors_outside_of_it_once(outside, variance_m2, is_by_
     solved.insert(L(3), ORIGIN)
     inside = graph_of([point_prior(L(2), ORIGIN, WEAK_M), near(2, 3, 0.1)])
     inside.push_back(outside)
-    window = FixedLagWindow(1e-6, 1e9, is_by_qr=is_by_qr)
+    window = FixedLagWindow(Thresholds(1e-6, 1e-6), 1e9, is_by_qr=is_by_qr)
     window.begin(inside, {}, solved, {L(2): 0.0, L(3): 0.0})
     expected = 1.0 / (1.0 / WEAK_M**2 + 1.0 / variance_m2)
     assert window.isam.marginalCovariance(L(2)) == pytest.approx(expected * np.eye(3), rel=1e-6)
@@ -67,7 +67,7 @@ def test_a_window_counts_factors_outside_of_it_once(outside, variance_m2, is_by_
 def test_a_marginal_holds_where_it_was_made_though_the_window_is_linearised_elsewhere(is_by_qr: bool):
     """One prior is at 0 m, of a point that has left, and one at 3 m, equally certain."""
     graph = graph_of([point_prior(L(1), ORIGIN, 0.6), near(1, 2, 0.8), point_prior(L(2), np.full(3, 3.0), 1.0)])
-    window = FixedLagWindow(1e-6, 1e9, is_by_qr=is_by_qr)
+    window = FixedLagWindow(Thresholds(1e-6, 1e-6), 1e9, is_by_qr=is_by_qr)
     window.begin(graph, {}, values_of(L1=ORIGIN, L2=ORIGIN), {L(2): 0.0})
     for _ in range(2):
         window.update({}, gtsam.Values(), {L(2): 0.0}, 1e9, removed=())

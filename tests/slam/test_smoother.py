@@ -10,7 +10,7 @@ from sonar_graph.slam import factors
 from sonar_graph.slam.smoother import Smoother, batch_solution
 from sonar_graph.slam.smoother.batch_solution import solve
 from sonar_graph.slam.smoother.factor_store import FactorGroup
-from sonar_graph.slam.smoother.window import WholeWindow
+from sonar_graph.slam.smoother.window import Thresholds, WholeWindow
 
 from .fed import FOREVER_S, NEVER_M, SONAR, Fed, assert_is_least_squares, in_the_basin, on_the_rail, ranged
 from .graphs import block_of, off_sigmas
@@ -344,7 +344,7 @@ def test_a_start_that_is_hardly_known_is_smoothed_to_the_end():
 def test_a_factor_in_python_is_handed_no_copy_of_all_values():
     """GTSAM would copy them for each factor: with 600 variables the copy takes longer than the factor."""
     handed = []
-    window = WholeWindow(1e-9)
+    window = WholeWindow(Thresholds(1e-9, 1e-9))
 
     def error(_, values, jacobians):
         handed.append(values is window.linearised_at)

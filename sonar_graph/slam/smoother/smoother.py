@@ -25,11 +25,14 @@ from sonar_graph.slam.smoother.covariance import JointCovariance, KeptCovariance
 from sonar_graph.slam.smoother.factor_store import FactorGroup, Factors, FactorStore
 from sonar_graph.slam.smoother.observability import Blame, Withheld
 from sonar_graph.slam.smoother.variables import is_pose, picked, variable_name
-from sonar_graph.slam.smoother.window import FixedLagWindow, WholeWindow
+from sonar_graph.slam.smoother.window import FixedLagWindow, Thresholds, WholeWindow
 from sonar_graph.tagged_sections import tagged
 
 MOST_MESSAGES = 1000
 """Messages about withheld factors that are kept."""
+MOST_NOISE_SHARE = 0.2
+"""Change of a position, as a share of the sonar's range noise, above which a keyframe is relinearised: iSAM2 computes
+the weights of a robust kernel only when it linearises a factor."""
 LEAST_SUSPICIOUS = 1.0
 """Step of the newest keyframe or of a landmark (rad or m) from which an update is tested for divergence."""
 LEAST_ITERATED = 0.03
@@ -55,7 +58,8 @@ class SmootherParams(Section):
     lag_s: float = Field(15.0, gt=0)
     """Age from which a bounded history marginalises poses. A whole history keeps all poses."""
     relinearize_threshold: float = Field(0.01, gt=0)
-    """Change of a component of a variable (rad or m) above which the variable is relinearised."""
+    """Change of a component of a variable (rad or m) above which the variable is relinearised. For the position of a
+    keyframe a fifth of the sonar's range noise, if that is less."""
     relinearize_interval_s: float = Field(1.0, ge=0)
     """Least time between two relinearisations. 0: every update may relinearise."""
     stale_shift_m: float = Field(0.1, gt=0)
@@ -200,12 +204,20 @@ class Smoother:
         What is kept of poses older than the lag.
     departures
         Takes note of variables that leave a bounded history.
+    range_sigma_m
+        Noise of the sonar's range, which bounds the threshold of positions (`MOST_NOISE_SHARE`).
     """
 
     def __init__(
-        self, params: SmootherParams, history: HistoryParams | None = None, departures: Departures | None = None
+        self,
+        params: SmootherParams,
+        history: HistoryParams | None = None,
+        departures: Departures | None = None,
+        range_sigma_m: float = np.inf,
     ) -> None:
         self.params = params
+        position_m = min(params.relinearize_threshold, MOST_NOISE_SHARE * range_sigma_m)
+        self._thresholds = Thresholds(position_m, params.relinearize_threshold)
         self.history = history or WholeHistory()
         self.estimates = Estimates()
         """The newest estimate of every variable in the window."""
@@ -232,10 +244,9 @@ class Smoother:
         self._taken_up = gtsam.NonlinearFactorGraph()
 
     def _empty_window(self) -> WholeWindow | FixedLagWindow:
-        threshold = self.params.relinearize_threshold
         if isinstance(self.history, BoundedHistory):
-            return FixedLagWindow(threshold, self.params.lag_s, is_by_qr=self._is_by_qr)
-        return WholeWindow(threshold, is_by_qr=self._is_by_qr)
+            return FixedLagWindow(self._thresholds, self.params.lag_s, is_by_qr=self._is_by_qr)
+        return WholeWindow(self._thresholds, is_by_qr=self._is_by_qr)
 
     # ---------------------------------------------------------------- what the graph is made of
 

@@ -8,13 +8,13 @@ slower: a window changes to QR when Cholesky has failed, and stays with it (docs
 """
 
 from collections.abc import Container, Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
 
 from sonar_graph.slam.smoother.factor_store import FactorGroup, graph_of
-from sonar_graph.slam.smoother.variables import picked
+from sonar_graph.slam.smoother.variables import BIAS, LANDMARK, TANGENT_SIZES, picked
 
 NEVER = 1_000_000_000
 """Updates between two relinearisations that iSAM2 would begin by itself."""
@@ -22,11 +22,24 @@ Times = Mapping[Any, float]
 """Time (s) at which a variable was last used, by key."""
 
 
-def isam2_params(relinearize_threshold: float, *, is_by_qr: bool) -> gtsam.ISAM2Params:
+class Thresholds(NamedTuple):
+    """Changes of a component of a variable above which the variable is relinearised."""
+
+    position_m: float
+    """Of the position of a keyframe."""
+    other: float
+    """Of the rotation of a keyframe (rad), of a landmark (m), and of the biases."""
+
+
+def isam2_params(thresholds: Thresholds, *, is_by_qr: bool) -> gtsam.ISAM2Params:
     """Settings of iSAM2."""
+    by_kind = gtsam.ISAM2ThresholdMap()
+    by_kind.insert(("x", np.repeat([thresholds.other, thresholds.position_m], 3)))
+    by_kind.insert(("l", np.full(TANGENT_SIZES[LANDMARK], thresholds.other)))
+    by_kind.insert(("b", np.full(TANGENT_SIZES[BIAS], thresholds.other)))
     params = gtsam.ISAM2Params()
     params.setFactorization("QR" if is_by_qr else "CHOLESKY")
-    params.setRelinearizeThreshold(relinearize_threshold)
+    params.setRelinearizeThreshold(by_kind)
     params.findUnusedFactorSlots = True
     return params
 
@@ -34,8 +47,8 @@ def isam2_params(relinearize_threshold: float, *, is_by_qr: bool) -> gtsam.ISAM2
 class WholeWindow:
     """iSAM2 over all variables of the run."""
 
-    def __init__(self, relinearize_threshold: float, *, is_by_qr: bool = False) -> None:
-        params = isam2_params(relinearize_threshold, is_by_qr=is_by_qr)
+    def __init__(self, thresholds: Thresholds, *, is_by_qr: bool = False) -> None:
+        params = isam2_params(thresholds, is_by_qr=is_by_qr)
         params.relinearizeSkip = NEVER
         self.isam = gtsam.ISAM2(params)
         self.linearised_at = self.isam.getLinearizationPoint()
@@ -90,14 +103,14 @@ class FixedLagWindow:
 
     Parameters
     ----------
-    relinearize_threshold
-        Change of a component of a variable above which the variable is relinearised.
+    thresholds
+        Changes of a variable above which it is relinearised.
     lag_s
         Age from which variables are marginalised.
     """
 
-    def __init__(self, relinearize_threshold: float, lag_s: float, *, is_by_qr: bool = False) -> None:
-        self._params = isam2_params(relinearize_threshold, is_by_qr=is_by_qr)
+    def __init__(self, thresholds: Thresholds, lag_s: float, *, is_by_qr: bool = False) -> None:
+        self._params = isam2_params(thresholds, is_by_qr=is_by_qr)
         self._params.relinearizeSkip = 1
         self._is_by_qr = is_by_qr
         self._begin_empty(lag_s)
