@@ -61,14 +61,31 @@ LANE_M, APART_M, SPEED_M_S, RANGE_MAX_M, HALF_APERTURE_RAD = 100.0, 6.0, 1.0, 10
 
 def survey(landmarks: int = 1000, seed: int = 1) -> Sequence:
     """Lanes of 100 m, 6 m apart, over landmarks at random; all lie in the plane."""
-    rng = np.random.default_rng(seed)
     lanes = max(2, round(landmarks / 80))
-    points = rng.uniform((0.0, -2.0), (LANE_M, lanes * APART_M + 2.0), (landmarks, 2))
-    lane, turn = round(LANE_M / SPEED_M_S * RATE_HZ), round(np.pi * APART_M / 2 / SPEED_M_S * RATE_HZ)
+    return along_lanes(lanes, LANE_M, landmarks, seed)
+
+
+def repeated_survey(minutes: float, seed: int = 1) -> Sequence:
+    """A field of 60 m x 60 m with 200 landmarks, surveyed to and fro for so long, with a frame every 4 s."""
+    lanes = round(60.0 * minutes * SPEED_M_S / (60.0 + np.pi * APART_M / 2))
+    return along_lanes(lanes, 60.0, 200, seed, lanes_a_lap=10, frame_every=round(4.0 * RATE_HZ))
+
+
+def along_lanes(
+    lanes: int, lane_m: float, landmarks: int, seed: int, *, lanes_a_lap: int = 10**6, frame_every: int = 1
+) -> Sequence:
+    """Measurements along lanes, 6 m apart; after ``lanes_a_lap`` lanes the vehicle goes back over them."""
+    rng = np.random.default_rng(seed)
+    width_m = min(lanes, lanes_a_lap) * APART_M
+    points = rng.uniform((0.0, -2.0), (lane_m, width_m + 2.0), (landmarks, 2))
+    lane = round(lane_m / SPEED_M_S * RATE_HZ)
+    turn = round(np.pi * APART_M / 2 / SPEED_M_S * RATE_HZ)
+    side = 1.0
     rates = []
     for k in range(lanes):
-        side = 1.0 if k % 2 == 0 else -1.0
         rates += [0.0] * lane + [side * np.pi * RATE_HZ / turn] * turn
+        if (k + 1) % lanes_a_lap:
+            side = -side
     n, dt = len(rates), 1.0 / RATE_HZ
     heading = np.concatenate([[0.0], np.cumsum(rates) * dt])
     middle = 0.5 * (heading[1:] + heading[:-1])
@@ -81,6 +98,8 @@ def survey(landmarks: int = 1000, seed: int = 1) -> Sequence:
     velocity[1:, :2] += SPEED_SIGMA_M_S * rng.standard_normal((n, 2))
     rows = []
     for k in range(1, n + 1):
+        if k % frame_every:
+            continue
         away = points - xy[k]
         distance = np.hypot(*away.T)
         azimuth = (np.arctan2(away[:, 1], away[:, 0]) - heading[k] + np.pi) % (2 * np.pi) - np.pi
@@ -106,7 +125,7 @@ def survey(landmarks: int = 1000, seed: int = 1) -> Sequence:
     )
     cov = np.tile(np.diag(np.square(calibration.dvl.velocity_sigma_m_s)), (n + 1, 1, 1))
     return Sequence(
-        name=f"survey of {landmarks} landmarks",
+        name=f"survey of {landmarks} landmarks, {n * dt:.0f} s",
         calibration=calibration,
         imu=Imu(stamps_ns, gyro, np.full((n + 1, 3), np.nan)),
         dvl=Dvl(stamps_ns, velocity, cov),
@@ -139,9 +158,11 @@ def run(sequence: Sequence, until_s: float | None = None) -> dict[str, Any]:
         ratios.append(sigmas(estimator, "window", landmark=i) / np.sqrt(np.diag(exact)[:2]))
     ratio = np.concatenate(ratios)
     cpu_ms = 1e3 * np.array(cpu_s)
+    by_ten_minutes_s = np.bincount((stamps - sequence.start_ns) // (600 * NS_PER_S), weights=cpu_s)
     return {
         "log": sequence.name,
         "updates": len(stamps),
+        "by_ten_minutes_s": by_ten_minutes_s.tolist(),
         "keyframes": newest + 1,
         "landmarks": len(batch),
         "median_ms": float(np.median(cpu_ms)),
