@@ -23,30 +23,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from baselines.events import (
-    DEPTH,
-    END,
-    EPOCH,
-    FIX,
-    FRAME,
-    HEADING,
-    NO_BIAS,
-    Events,
-    Interval,
-    Model,
-    Motion,
-    Samples,
-    Views,
-    body_measurement,
-    elevation_of_new,
-    extend,
-    motion_to,
-    up_at_end,
-)
+from baselines.events import DEPTH, HEADING, Model, Motion, Sonar, body_measurement, elevation_of_new
 from baselines.filter import FilterParams, FilterShell
 from baselines.kalman import (
     GATED,
-    NEW,
+    Judged,
     bordered,
     correction,
     distance,
@@ -58,9 +39,8 @@ from baselines.kalman import (
     symmetric,
 )
 from sonar_graph.calibration import Calibration, Section
-from sonar_graph.measurements import Floats, Ints
+from sonar_graph.measurements import Floats
 from sonar_graph.models import (
-    ACCEPTED,
     FLOOR_GATE,
     huber_scale,
     locate_from_body,
@@ -156,36 +136,31 @@ def update(x: Floats, P: Floats, H: Floats, e: Floats, R: Floats) -> None:
 
 
 @compiled
-def observe(x: Floats, P: Floats, motion: Motion, model: Model, views: Views, row: int) -> None:
-    """Update by range and azimuth of a known landmark; write outcome, e of (7) and its covariance S."""
-    at = MAP + LANDMARK * views.slot[row]
-    p = x[at : at + LANDMARK]
-    R_z = views.R_z[row]
+def observe(
+    x: Floats, P: Floats, at: int, motion: Motion, sonar: Sonar, z: Floats, R_z: Floats
+) -> tuple[int, Floats, Floats]:
+    """Update by range and azimuth of a known landmark at ``x[at : at + 3]``; outcome, e of (7) and S."""
     R, X, T = pose_after(x, motion)
-    z_hat, H_b, H_p = view_from_body(R, X, model.mount, p)  # (6)
-    e = views.z[row] - z_hat  # (7)
+    z_hat, H_b, H_p = view_from_body(R, X, sonar.mount, x[at : at + LANDMARK])  # (6)
+    e = z - z_hat  # (7)
     e[1] = wrap_angle(e[1])
     H = np.zeros((2, len(x)))
     H[:, :POSE] = H_b @ T
     H[:, at : at + LANDMARK] = H_p
     noise = H_b @ motion.C @ H_b.T + R_z
     S = symmetric(H @ P @ H.T + noise)
-    outcome, widened = judged(e, S, R_z, model.gate, model.kernel_width)
-    views.outcome[row] = outcome
-    views.e[row] = e
-    views.S[row] = S
+    outcome, widened = judged(e, S, R_z, sonar.gate, sonar.kernel_width)
     if outcome != GATED:
         update(x, P, H, e, noise + widened)
+    return outcome, e, S
 
 
-@compiled
-def observe_far(x: Floats, P: Floats, motion: Motion, model: Model, views: Views, row: int) -> bool:
-    """Update as `observe` by a landmark far from where it is predicted, ``0 = g(x_v, z) - p``; False if it is near."""
-    at = MAP + LANDMARK * views.slot[row]
-    z = views.z[row]
-    R_z = views.R_z[row]
+def observe_far(
+    x: Floats, P: Floats, at: int, motion: Motion, sonar: Sonar, z: Floats, R_z: Floats
+) -> Judged | None:
+    """Update as `observe` by a landmark far from where it is predicted, ``0 = g(x_v, z) - p``; None if it is near."""
     R, X, T = pose_after(x, motion)
-    g, G_b, G_z = locate_from_body(R, X, model.mount, z, 0.0)
+    g, G_b, G_z = locate_from_body(R, X, sonar.mount, z, 0.0)
     e = g - x[at : at + LANDMARK]
     H = np.zeros((LANDMARK, len(x)))
     H[:, :POSE] = -G_b @ T
@@ -193,36 +168,38 @@ def observe_far(x: Floats, P: Floats, motion: Motion, model: Model, views: Views
     noise = G_b @ motion.C @ G_b.T
     S = H @ P @ H.T + noise
     if not is_far(S, G_z, z[0], R_z):
-        return False
-    V = G_z @ far_covariance(R_z, z[0], model.aperture_rad) @ G_z.T
-    outcome, e_z, S_z, widened = judged_far(e, symmetric(S + V), G_z, R_z, model.gate, model.kernel_width)
-    views.outcome[row] = outcome
-    views.e[row] = e_z
-    views.S[row] = symmetric(S_z)
+        return None
+    V = G_z @ far_covariance(R_z, z[0], sonar.aperture_rad) @ G_z.T
+    outcome, e_z, S_z, widened = judged_far(e, symmetric(S + V), G_z, R_z, sonar.gate, sonar.kernel_width)
     if outcome != GATED:
         update(x, P, H, e, symmetric(noise + V + widened))
-    return True
+    return Judged(outcome, e_z, symmetric(S_z))
 
 
 @compiled
-def update_body(x: Floats, P: Floats, motion: Motion, model: Model, samples: Samples, row: int) -> None:
-    """Update by a depth, a heading or a position fix, the latter two with Huber's kernel."""
-    kind = samples.kind[row]
+def update_body(
+    x: Floats, P: Floats, motion: Motion, model: Model, kind: int, value: Floats, noise: Floats
+) -> float:
+    """Update by a depth, a heading or a position fix, the latter two with Huber's kernel.
+
+    Returns the distance from the estimate in sigmas, where the bias of the compass counts as noise.
+    """
     R, X, T = pose_after(x, motion)
-    e, H_b, R_z = body_measurement(R, X, model, samples, row)
+    e, H_b, R_z = body_measurement(R, X, kind, model.port if kind == DEPTH else model.antenna, value, noise)
     H = np.zeros((len(e), len(x)))
     H[:, :POSE] = H_b @ T
-    noise = H_b @ motion.C @ H_b.T
+    R_b = H_b @ motion.C @ H_b.T + R_z
+    S = H @ P @ H.T + R_b
     if kind == HEADING:
-        e[0] = wrap_angle(e[0])
-        samples.distance[row] = distance(e, H @ P @ H.T + noise + R_z + model.compass_variance_rad2)
+        off = distance(e, S + model.compass_variance_rad2)
         e[0] = wrap_angle(e[0] - x[COMPASS])
         H[0, COMPASS] = 1.0
-    S = H @ P @ H.T + noise + R_z
-    if kind == FIX:
-        samples.distance[row] = distance(e, S)
+        S = H @ P @ H.T + R_b
+    else:
+        off = distance(e, S)
     scale = 1.0 if kind == DEPTH else huber_scale(e, S)
-    update(x, P, H, e, noise + scale * R_z)
+    update(x, P, H, e, R_b + (scale - 1.0) * R_z)
+    return off
 
 
 @compiled
@@ -236,7 +213,6 @@ def update_up(x: Floats, P: Floats, up: Floats, sigma_rad: float) -> None:
     update(x, P, H, e, np.diag(np.array([(sigma_rad / level) ** 2, sigma_rad**2])))
 
 
-@compiled
 def update_plane(x: Floats, P: Floats, plane: Floats) -> None:
     """Update Z, roll and pitch by the plane on which the vehicle stays."""
     H = np.zeros((3, len(x)))
@@ -250,84 +226,26 @@ def update_plane(x: Floats, P: Floats, plane: Floats) -> None:
 # -------------------------------------------------------------------------------- augmentation
 
 
-@compiled
-def augment(x: Floats, P: Floats, motion: Motion, model: Model, z: Floats, R_z: Floats) -> tuple[Floats, Floats]:
+def augment(x: Floats, P: Floats, motion: Motion, sonar: Sonar, z: Floats, R_z: Floats) -> tuple[Floats, Floats]:
     """State and covariance with a new landmark ``p = g(x_v, z, elevation)``, on a floor of known height if it is near.
 
     ``P_pv = G_v P_v.``,  ``P_pp = G_v P_vv G_v^T + G_b C G_b^T + G_z diag(R_z, elevation_sigma^2) G_z^T``.
     """
     R, X, T = pose_after(x, motion)
-    p, G_b, G_z = locate_from_body(R, X, model.mount, z, elevation_of_new(R, X, model, z))
+    p, G_b, G_z = locate_from_body(R, X, sonar.mount, z, elevation_of_new(R, X, sonar, z))
     G_v = G_b @ T
     P_pv = G_v @ P[:POSE]  # (3, n)
     P_pp = P_pv[:, :POSE].copy() @ G_v.T + G_b @ motion.C @ G_b.T
-    P_pp += G_z @ polar_covariance(R_z, model.aperture_rad) @ G_z.T
+    P_pp += G_z @ polar_covariance(R_z, sonar.aperture_rad) @ G_z.T
     n = len(x)
     x = np.concatenate((x, p))
     P = bordered(P, P_pv, symmetric(P_pp))
     H = np.zeros((1, n + LANDMARK))
     H[0, -1] = 1.0
-    e = np.array([model.floor_z_m - x[-1]])  # NaN where the floor is not known
-    if e[0] ** 2 <= FLOOR_GATE * (P[-1, -1] + model.floor_variance_m2):
-        update(x, P, H, e, np.array([[model.floor_variance_m2]]))
+    e = np.array([sonar.floor_z_m - x[-1]])  # NaN where the floor is not known
+    if e[0] ** 2 <= FLOOR_GATE * (P[-1, -1] + sonar.floor_variance_m2):
+        update(x, P, H, e, np.array([[sonar.floor_variance_m2]]))
     return x, P
-
-
-# -------------------------------------------------------------------------------- the filter
-
-
-@compiled
-def see(
-    x: Floats, P: Floats, motion: Motion, model: Model, events: Events, first: int
-) -> tuple[Floats, Floats]:
-    """Update by the known landmarks of a frame, and append the new ones, in the order of their rows."""
-    views = events.views
-    row = first
-    while row < len(views.stamp_ns) and views.stamp_ns[row] == views.stamp_ns[first]:
-        if views.outcome[row] == ACCEPTED:
-            if MAP + LANDMARK * views.slot[row] == len(x):
-                x, P = augment(x, P, motion, model, views.z[row], views.R_z[row])
-                views.outcome[row] = NEW
-            elif not (events.may_be_far and observe_far(x, P, motion, model, views, row)):
-                observe(x, P, motion, model, views, row)
-        row += 1
-    return x, P
-
-
-@compiled
-def advance(
-    x: Floats, P: Floats, interval: Interval, model: Model, events: Events, k: int, overturned: Ints
-) -> tuple[Floats, Floats, int]:
-    """Use the events from k on, up to a gap of the Doppler log or the end of the call; x, P and that event's number.
-
-    ``overturned``: epoch (ns) and pitch (degrees) where the Euler angles first become singular; zero before.
-    """
-    order = events.order
-    while not math.isnan(events.motions.dp[k, 0]):
-        motion = motion_to(events, k, NO_BIAS, rotation_from_euler(x[ROLL:POSE]).T @ model.earth)
-        kind = order.kind[k]
-        row = order.row[k]
-        if kind == END:
-            break
-        if kind == EPOCH:
-            predict(x, P, motion)
-            extend(interval, motion)
-            if model.is_planar:
-                update_plane(x, P, model.plane)
-            if order.interval[k] >= 0:
-                ends = events.gravity[order.interval[k]]
-                up = up_at_end(interval, ends)
-                if not math.isnan(up[0]):
-                    update_up(x, P, up, ends[7])
-        elif kind == FRAME:
-            x, P = see(x, P, motion, model, events, row)
-        else:
-            update_body(x, P, motion, model, events.samples, row)
-        if abs(x[PITCH]) >= MOST_PITCH_RAD and not overturned[0]:
-            overturned[0] = order.end_ns[k] if kind == EPOCH else order.start_ns[k]
-            overturned[1] = round(math.degrees(x[PITCH]))
-        k += 1
-    return x, P, k
 
 
 class EkfSlamParams(FilterParams):
@@ -376,16 +294,39 @@ class EkfSlam(FilterShell):
         self._P[:3, :3] = np.diag(np.square(start.position_sigma_m))
         self._P[ROLL:POSE, ROLL:POSE] = E @ np.diag(np.square(start.rpy_sigma_rad)) @ E.T
         self._P[COMPASS, COMPASS] = calibration.heading.bias_sigma_rad**2
-        self._overturned = np.zeros(2, np.int64)
+        self._overturned: list[str] = []
 
     def state(self) -> tuple[int, Floats, Floats]:
         """Stamp (ns), x of equation (4) and P of (5) at the newest epoch; copies."""
         return self.node_ns, self._x.copy(), self._P.copy()
 
-    def advance(self, events: Events, k: int) -> int:
-        """Use the events from k on, up to a gap or the end of the call."""
-        self._x, self._P, k = advance(self._x, self._P, self.interval, self.model, events, k, self._overturned)
-        return k
+    def predict(self, motion: Motion, duration_s: float) -> None:  # noqa: ARG002  # the bias of other filters walks
+        """Carry the state over the motion to the next epoch."""
+        predict(self._x, self._P, motion)
+
+    def observe(self, motion: Motion, slot: int, z: Floats, R_z: Floats) -> Judged:
+        """Update by range and azimuth of a known landmark, (6) and (7)."""
+        return Judged(*observe(self._x, self._P, MAP + LANDMARK * slot, motion, self.model.sonar, z, R_z))
+
+    def observe_far(self, motion: Motion, slot: int, z: Floats, R_z: Floats) -> Judged | None:
+        """Update by a landmark that may be far from where it is predicted."""
+        return observe_far(self._x, self._P, MAP + LANDMARK * slot, motion, self.model.sonar, z, R_z)
+
+    def augment(self, motion: Motion, z: Floats, R_z: Floats) -> None:
+        """Append a landmark to (4) and (5)."""
+        self._x, self._P = augment(self._x, self._P, motion, self.model.sonar, z, R_z)
+
+    def update_body(self, motion: Motion, kind: int, value: Floats, noise: Floats) -> float:
+        """Update by a depth, a heading or a position fix."""
+        return update_body(self._x, self._P, motion, self.model, kind, value, noise)
+
+    def update_up(self, up: Floats, sigma_rad: float, i_R_j: Floats) -> None:  # noqa: ARG002  # (4) has no bias
+        """Update roll and pitch by the direction of the world's up."""
+        update_up(self._x, self._P, up, sigma_rad)
+
+    def update_plane(self) -> None:
+        """Update Z, roll and pitch by the plane on which the vehicle stays."""
+        update_plane(self._x, self._P, self.model.plane)
 
     def pose_after(self, motion: Motion) -> tuple[Floats, Floats, Floats]:
         """world_R_body (3, 3), position (3,), and covariance of [theta, rho] (6, 6) a motion after the state."""
@@ -401,14 +342,15 @@ class EkfSlam(FilterShell):
         """world_R_body of the state, shape (3, 3)."""
         return rotation_from_euler(self._x[ROLL:POSE])
 
+    def check(self, epoch_ns: int) -> None:
+        """Note a state whose Euler angles are singular; the next prediction reads them from the rotation."""
+        if abs(self._x[PITCH]) >= MOST_PITCH_RAD and not self._overturned:
+            self._overturned = [
+                f"pitch came to {math.degrees(self._x[PITCH]):.0f} deg, first at {epoch_ns} ns, where the Euler angles"
+                " of its state are singular, or beyond: the filter has lost its way, by wrong gyros, velocities or"
+                " detections; or it needs another estimator, such as isam2"
+            ]
+
     def withheld(self) -> list[str]:
         """Messages of both filters, and one about a pitch of 90 degrees or more."""
-        epoch_ns, pitch_deg = self._overturned.tolist()
-        if not epoch_ns:
-            return super().withheld()
-        return [
-            *super().withheld(),
-            f"pitch came to {pitch_deg} deg, first at {epoch_ns} ns, where the Euler angles of its state are singular,"
-            " or beyond: the filter has lost its way, by wrong gyros, velocities or detections; or it needs another"
-            " estimator, such as isam2",
-        ]
+        return [*super().withheld(), *self._overturned]

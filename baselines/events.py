@@ -16,14 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonar_graph.measurements import Floats, Ints
-from sonar_graph.models import ACCEPTED, Mount, body_point_jacobian, floor_elevation, yaw_and_derivative
-from sonar_graph.motion import Motions
-from sonar_graph.navigation.alignment import up_direction
-from sonar_graph.numerics import compiled, cross_matrix, left_jacobian, rotation_exp
+from sonar_graph.models import ACCEPTED, Mount, body_point_jacobian, floor_elevation, wrap_angle, yaw_and_derivative
+from sonar_graph.numerics import compiled, cross_matrix, rotation_exp
 
 EPOCH, DEPTH, HEADING, FIX, FRAME, END = range(6)
 """Kinds of events; at equal stamps the lower comes first."""
-NO_BIAS = np.zeros(3)
 NOT_STARTED, LONG_AGO = int(np.iinfo(np.int64).max), int(np.iinfo(np.int64).min)
 
 
@@ -42,15 +39,24 @@ class Motion(NamedTuple):
     """Integral of the specific force in frame i, shape (3,), m/s."""
 
 
-class Model(NamedTuple):
-    """Numbers of the calibration and the settings that the equations of both filters need."""
+class Sonar(NamedTuple):
+    """Sonar and floor, and the treatment of doubtful detections."""
 
     mount: Mount
-    """Of the sonar."""
     aperture_rad: float
     floor_z_m: float
     """NaN where it is not known."""
     floor_variance_m2: float
+    gate: float
+    """Mahalanobis distance beyond which a detection is refused."""
+    kernel_width: float
+    """Of the Cauchy kernel, in standard deviations; infinite: none."""
+
+
+class Model(NamedTuple):
+    """Numbers of the calibration and the settings that the equations of both filters need."""
+
+    sonar: Sonar
     port: Floats
     """Pressure port in the body, shape (3,), m."""
     antenna: Floats
@@ -67,10 +73,6 @@ class Model(NamedTuple):
     """Height of the plane (m), variance of the height and of the tilt, shape (3,)."""
     walk: Floats
     """Densities of the biases' walk squared, shape (11,)."""
-    gate: float
-    """Mahalanobis distance beyond which a detection is refused."""
-    kernel_width: float
-    """Of the Cauchy kernel, in standard deviations; infinite: none."""
 
 
 class Samples(NamedTuple):
@@ -82,8 +84,6 @@ class Samples(NamedTuple):
     """Shape (s, 3): the position of a fix, the height of a depth sample as last number, the yaw as first."""
     noise: Floats
     """Covariances, shape (s, 3, 3), in the same places."""
-    distance: Floats
-    """Distance from the estimate in sigmas, shape (s,); NaN until the sample is used, and for depths."""
 
 
 class Views(NamedTuple):
@@ -98,6 +98,11 @@ class Views(NamedTuple):
     """`OUTCOME_NUMBERS`, or ACCEPTED: to be used."""
     e: Floats
     S: Floats
+
+
+def in_frame(views: Views, first: int) -> list[int]:
+    """Detections of a frame that are to be used, of which one is given."""
+    return np.flatnonzero((views.stamp_ns == views.stamp_ns[first]) & (views.outcome == ACCEPTED)).tolist()
 
 
 @compiled
@@ -126,24 +131,8 @@ class Order(NamedTuple):
     kind: Ints
     row: Ints
     """Number of the sample, or of the first detection of the frame."""
-    interval: Ints
-    """Number of the interval of gravity that ends at an epoch; -1: none."""
-
-
-class Events(NamedTuple):
-    """Events of a call, with all that they need."""
-
-    order: Order
-    motions: Motions
-    """Motions to the events; NaN over a gap, until the filter has bridged it."""
-    is_reduced: NDArray[np.bool_]
-    """True where the gyro bias and the Earth's rate are out of a motion."""
-    gravity: Floats
-    """Intervals of gravity: velocity of the IMU's point at both ends, duration, and sigma of the tilt, shape (g, 8)."""
-    samples: Samples
-    views: Views
-    may_be_far: bool
-    """True where landmarks may be far from where they are predicted."""
+    ends_interval: Ints
+    """1 where an interval of gravity ends at an epoch, else 0."""
 
 
 class Call(NamedTuple):
@@ -166,7 +155,7 @@ def in_order(
 ) -> Ints:
     """Order the epochs, samples and frames of a call, which end with `END`; columns of `Order` as rows, shape (6, n)."""
     out = np.empty((6, len(epochs_ns) + len(sample_ns) + len(views.stamp_ns) + 1), np.int64)
-    n = epoch = sample = view = interval = 0
+    n = epoch = sample = view = 0
     node_ns = call.node_ns
     opened_ns = call.opened_ns
     frame_ns = LONG_AGO
@@ -197,13 +186,12 @@ def in_order(
         out[2, n] = epochs_ns[row] if kind == EPOCH else stamp_ns
         out[3, n] = kind
         out[4, n] = row
-        out[5, n] = -1
+        out[5, n] = 0
         if kind == EPOCH:
             epoch += 1
             node_ns = epochs_ns[row]
             if 0 < call.interval_ns <= node_ns - opened_ns:
-                out[5, n] = interval
-                interval += 1
+                out[5, n] = 1
                 opened_ns = node_ns
         elif kind == FRAME:
             frame_ns = stamp_ns
@@ -214,79 +202,43 @@ def in_order(
 
 
 @compiled
-def motion_to(events: Events, k: int, bias: Floats, earth: Floats) -> Motion:
-    """Motion to an event without a gyro bias and the Earth's rate (frame i, both in rad/s), to first order.
+def remove_rate(motion: Motion, bias: Floats, earth: Floats) -> Motion:
+    """Motion without a gyro bias and the Earth's rate (frame i, both in rad/s), to first order.
 
     For gyros the Earth's rate is a bias, the mean of its values in frames i and j. The specific force turns by half of
     the correction of the rotation.
     """
-    dR = events.motions.dR[k]
-    dp = events.motions.dp[k]
-    D = events.motions.D[k]
-    impulse = events.motions.impulse[k]
-    if not events.is_reduced[k]:
-        rate = bias + 0.5 * (earth + dR.T @ earth)
-        theta = D[:3] @ rate
-        dp += dR @ (D[3:] @ rate)
-        impulse += 0.5 * cross_matrix(dR @ theta) @ impulse
-        dR[:] = dR @ rotation_exp(theta)
-        events.is_reduced[k] = True
-    return Motion(dR, dp, events.motions.C[k], D, impulse)
-
-
-class Interval(NamedTuple):
-    """Interval of gravity from an epoch i to the epoch of the state."""
-
-    i_R_j: Floats
-    impulse: Floats
-    """Integral of the specific force in frame i, shape (3,), m/s."""
+    dR, dp, C, D, impulse = motion
+    rate = bias + 0.5 * (earth + dR.T @ earth)
+    theta = D[:3] @ rate
+    rho = D[3:] @ rate
+    impulse = impulse + 0.5 * cross_matrix(dR @ theta) @ impulse
+    return Motion(dR @ rotation_exp(theta), dp + dR @ rho, C, D, impulse)
 
 
 @compiled
-def extend(interval: Interval, motion: Motion) -> None:
-    """Extend an interval of gravity by a motion."""
-    interval.impulse[:] += interval.i_R_j @ motion.impulse
-    interval.i_R_j[:] = interval.i_R_j @ motion.dR
+def body_measurement(
+    R: Floats, X: Floats, kind: int, arm: Floats, value: Floats, noise: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Innovation e (m,), H_b (m, 6) and R_z (m, m) of a depth, a heading or a position fix by a body at (R, X).
 
-
-@compiled
-def up_at_end(interval: Interval, ends: Floats) -> Floats:
-    """World's up in the body at the end of an interval, shape (3,), NaN if not measured; the next interval begins.
-
-    ``ends``: a row of `Events.gravity`.
+    H_b is the derivative of what is measured by the perturbation [theta, rho] of the body; ``arm`` the pressure port or
+    the antenna in the body, ``value`` and ``noise`` a row of `Samples`. The compass is taken without bias.
     """
-    duration_s = ends[6]
-    up = up_direction(interval.impulse / duration_s, interval.i_R_j, ends[:3], ends[3:6], duration_s)
-    interval.i_R_j[:] = np.eye(3)
-    interval.impulse[:] = 0.0
-    return up
-
-
-@compiled
-def body_measurement(R: Floats, X: Floats, model: Model, samples: Samples, row: int) -> tuple[Floats, Floats, Floats]:
-    """Innovation e (m,) of a depth, a heading or a position fix by a body at (R, X), and its covariance R_z (m, m).
-
-    Between them H_b, the derivative of what is measured by the perturbation [theta, rho] of the body, shape (m, 6). A
-    compass without bias is assumed.
-    """
-    value = samples.value[row]
-    noise = samples.noise[row]
-    kind = samples.kind[row]
     if kind == HEADING:
         yaw_rad, by_turn = yaw_and_derivative(R)
         H_b = np.zeros((1, 6))
         H_b[0, :3] = by_turn
-        return value[:1] - yaw_rad, H_b, noise[:1, :1]
+        return np.array([wrap_angle(value[0] - yaw_rad)]), H_b, noise[:1, :1]
     first = 2 if kind == DEPTH else 0  # a depth sample is the height alone
-    q = model.port if kind == DEPTH else model.antenna
-    e = value - (X + R @ q)
-    return e[first:], body_point_jacobian(R, q)[first:], noise[first:, first:]
+    e = value - (X + R @ arm)
+    return e[first:], body_point_jacobian(R, arm)[first:], noise[first:, first:]
 
 
 @compiled
-def elevation_of_new(R: Floats, X: Floats, model: Model, z: Floats) -> float:
+def elevation_of_new(R: Floats, X: Floats, sonar: Sonar, z: Floats) -> float:
     """Elevation of a new landmark seen by a body at (R, X): on the floor; 0 without a floor within the aperture."""
-    up = model.mount.body_R_sonar.T @ R[2]  # in the sonar's axes
-    height_m = model.floor_z_m - (X + R @ model.mount.body_p_sonar)[2]
+    up = sonar.mount.body_R_sonar.T @ R[2]  # in the sonar's axes
+    height_m = sonar.floor_z_m - (X + R @ sonar.mount.body_p_sonar)[2]
     elevation_rad = floor_elevation(up, height_m, z[0], z[1])
-    return elevation_rad if abs(elevation_rad) <= 0.5 * model.aperture_rad else 0.0
+    return elevation_rad if abs(elevation_rad) <= 0.5 * sonar.aperture_rad else 0.0

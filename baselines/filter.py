@@ -15,23 +15,25 @@ from pydantic import Field
 from baselines.events import (
     DEPTH,
     END,
+    EPOCH,
     FIX,
     FRAME,
     HEADING,
     LONG_AGO,
-    NO_BIAS,
     NOT_STARTED,
     Call,
-    Events,
-    Interval,
     Model,
     Motion,
     Order,
     Samples,
+    Sonar,
     Views,
+    in_frame,
     in_order,
     read_detections,
+    remove_rate,
 )
+from baselines.kalman import NEW, Judged
 from sonar_graph.calibration import Calibration, Section, require_params
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import (
@@ -52,8 +54,8 @@ from sonar_graph.models import (
     bias_sigmas,
     identify,
 )
-from sonar_graph.motion import Motions, MotionSource, require_source
-from sonar_graph.navigation.alignment import earth_rate_in_world, tilt_sigma
+from sonar_graph.motion import MotionSource, PreintegratedMotion, require_source
+from sonar_graph.navigation.alignment import earth_rate_in_world, tilt_sigma, up_direction
 from sonar_graph.states import (
     OUTCOME_NUMBERS,
     CausalEstimates,
@@ -72,7 +74,7 @@ KEPT_NS = 20_000_000_000
 kept, since dropping them costs as much as keeping a few."""
 
 NO_STAMPS = np.empty(0, np.int64)
-NO_SAMPLES = Samples(NO_STAMPS, NO_STAMPS, np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0))
+NO_SAMPLES = Samples(NO_STAMPS, NO_STAMPS, np.empty((0, 3)), np.empty((0, 3, 3)))
 NO_VIEWS = Views(
     stamp_ns=NO_STAMPS,
     slot=NO_STAMPS,
@@ -82,7 +84,7 @@ NO_VIEWS = Views(
     e=np.empty((0, 2)),
     S=np.empty((0, 2, 2)),
 )
-NO_GRAVITY = np.empty((0, 8))
+NO_BIAS = np.zeros(3)
 
 
 class FilterParams(Section):
@@ -110,13 +112,18 @@ def model_of(calibration: Calibration, params: FilterParams) -> Model:
     earth = earth_rate_in_world(calibration)
     # the chi-square distribution of two degrees of freedom is 1 - exp(-d^2 / 2)
     gate = math.inf if params.gate_probability == 1 else math.sqrt(-2.0 * math.log(1.0 - params.gate_probability))
-    return Model(
+    sonar_model = Sonar(
         mount=Mount(
             np.ascontiguousarray(sonar.mounting.pose().rotation().matrix()), np.array(sonar.mounting.translation_m)
         ),
         aperture_rad=sonar.elevation_aperture_rad,
         floor_z_m=floor.z_m if floor else math.nan,
         floor_variance_m2=floor.sigma_m**2 if floor else math.nan,
+        gate=gate,
+        kernel_width=params.kernel_width or math.inf,
+    )
+    return Model(
+        sonar=sonar_model,
         port=np.array(calibration.depth.port_m),
         antenna=np.array(calibration.positions.antenna_m),
         body_p_dvl=np.array(calibration.dvl.mounting.translation_m),
@@ -127,8 +134,6 @@ def model_of(calibration: Calibration, params: FilterParams) -> Model:
         is_planar=plane is not None,
         plane=np.array([plane.z_m, plane.z_sigma_m**2, plane.tilt_sigma_rad**2]) if plane else np.zeros(3),
         walk=bias_sigmas(calibration)[1] ** 2,
-        gate=gate,
-        kernel_width=params.kernel_width or math.inf,
     )
 
 
@@ -147,7 +152,6 @@ class FilterShell(ABC):
         self.odometry = odometry
         self.params = params
         self.model = model_of(calibration, params)
-        self.interval = Interval(np.eye(3), np.zeros(3))
         self.node_ns = 0
         """Stamp of the newest epoch, that of the state."""
         sonar = calibration.sonar
@@ -158,9 +162,14 @@ class FilterShell(ABC):
         self._done_ns = LONG_AGO
         self._opened_ns = 0
         self._opened_velocity = (np.zeros(3), 0.0)
+        self._turned = np.eye(3)
+        """Rotation since the interval of gravity began."""
+        self._impulse = np.zeros(3)
+        """Specific force since then, integrated in the frame of its start."""
         self._kept_ns = 0
         self._used_in_gap: dict[tuple[int, int], int] = {}
-        self._was_lost = False
+        self._may_be_far = False
+        self._landmarks = 0
         self._slots: dict[int, int] = {}
         self._journal = DetectionJournal()
         self._estimates = CausalEstimates()
@@ -170,8 +179,32 @@ class FilterShell(ABC):
     # ---------------------------------------------------------------- equations of a filter
 
     @abstractmethod
-    def advance(self, events: Events, k: int) -> int:
-        """Use the events from k on, up to a gap of the Doppler log or the end of the call, and return its number."""
+    def predict(self, motion: Motion, duration_s: float) -> None:
+        """Carry the state over the motion to the next epoch."""
+
+    @abstractmethod
+    def observe(self, motion: Motion, slot: int, z: Floats, R_z: Floats) -> Judged:
+        """Update by range and azimuth of a known landmark, a motion after the state."""
+
+    @abstractmethod
+    def observe_far(self, motion: Motion, slot: int, z: Floats, R_z: Floats) -> Judged | None:
+        """Update as `observe` by the point seen, where (6) and (7) are not linear enough; None where they are."""
+
+    @abstractmethod
+    def augment(self, motion: Motion, z: Floats, R_z: Floats) -> None:
+        """Append a landmark seen for the first time, a motion after the state."""
+
+    @abstractmethod
+    def update_body(self, motion: Motion, kind: int, value: Floats, noise: Floats) -> float:
+        """Update by a row of `Samples`, a motion after the state, and return its distance in sigmas."""
+
+    @abstractmethod
+    def update_up(self, up: Floats, sigma_rad: float, i_R_j: Floats) -> None:
+        """Update by the direction of the world's up in the body, measured over an interval from i to j."""
+
+    @abstractmethod
+    def update_plane(self) -> None:
+        """Update by the plane on which the vehicle stays."""
 
     @abstractmethod
     def pose_after(self, motion: Motion) -> tuple[Floats, Floats, Floats]:
@@ -184,6 +217,9 @@ class FilterShell(ABC):
     @abstractmethod
     def attitude(self) -> Floats:
         """world_R_body of the state, shape (3, 3)."""
+
+    def check(self, epoch_ns: int) -> None:
+        """Look at the state after an event."""
 
     def gyro_bias(self) -> Floats:
         """Estimated gyro bias, shape (3,), rad/s; zero where the state has none."""
@@ -215,7 +251,8 @@ class FilterShell(ABC):
         try:
             samples = self._samples(depth, measurements.heading, measurements.positions, since_ns)
             if end_ns >= max(self._reached_ns, self.node_ns):
-                estimate = self._run(Call(since_ns, end_ns, self.node_ns, self._opened_ns, self._interval_ns), samples, views)
+                call = Call(since_ns, end_ns, self.node_ns, self._opened_ns, self._interval_ns)
+                estimate = self._run(call, samples, views)
                 self._estimates.keep(estimate)
         except np.linalg.LinAlgError as error:
             raise EstimatorError(
@@ -247,7 +284,7 @@ class FilterShell(ABC):
     def withheld(self) -> list[str]:
         """Messages about headings, fixes and detections that the state contradicts."""
         messages = self._contradictions.messages()
-        if math.isfinite(self.model.gate) or math.isfinite(self.model.kernel_width):
+        if math.isfinite(self.model.sonar.gate) or math.isfinite(self.model.sonar.kernel_width):
             messages += lockout_messages(self.detections())
         return messages
 
@@ -347,7 +384,7 @@ class FilterShell(ABC):
             kind = int(samples.kind[row])
             stamp_ns = int(samples.stamp_ns[row])
             if is_sound[row] and kind == FIX and stamp_ns >= self.node_ns - KEPT_NS:
-                self._use_late(_rows(samples, slice(row, row + 1)), since_ns)
+                self._use_late(stamp_ns, samples.value[row], samples.noise[row], since_ns)
             else:
                 reason = Refusal.LATE if is_sound[row] else Refusal.UNSOUND
                 self._refused.append(RefusedRow(SENSORS[kind], stamp_ns, reason, math.nan))
@@ -357,54 +394,78 @@ class FilterShell(ABC):
 
     def _run(self, call: Call, samples: Samples, views: Views) -> Estimate:
         """Carry the state to the newest epoch reached at the end of the call, with all measurements on the way."""
-        events = self._events(call, samples, views)
-        k, motion = self._use(events)
+        epochs_ns, reached_ns = self.odometry.epochs_reached(self.node_ns, call.end_ns)
+        order = Order(*in_order(epochs_ns, reached_ns, samples.stamp_ns, samples.kind, views, call))
+        motions = self.odometry.motions(order.start_ns, order.end_ns, order.stamp_ns, NO_BIAS)
+        is_gap = np.isnan(motions.dp[:, 0]).tolist()
+        events = zip(order.kind.tolist(), order.row.tolist(), zip(*motions, strict=True), strict=True)
+        for k, (kind, row, columns) in enumerate(events):
+            motion = self._bridge(order, k, views) if is_gap[k] else self._reduced(Motion(*columns))
+            if kind == EPOCH:
+                self._to_epoch(motion, int(order.end_ns[k]), ends_interval=order.ends_interval[k])
+            elif kind == FRAME:
+                self._see(motion, views, row)
+            elif kind != END:
+                distance = self.update_body(motion, kind, samples.value[row], samples.noise[row])
+                if kind != DEPTH:
+                    self._contradictions.judge(SENSORS[kind], distance)
+            self.check(self.node_ns)
         R, X, covariance = self.pose_after(motion)
-        self.node_ns = int(events.order.start_ns[k])
         self.odometry.settle(self.node_ns)
         if self.node_ns > self._kept_ns + KEPT_NS:
             self.odometry.forget_before(self.node_ns - KEPT_NS)
             self._kept_ns = self.node_ns
         return Estimate(call.end_ns, gtsam.Pose3(gtsam.Rot3(R), X), covariance)
 
-    def _events(self, call: Call, samples: Samples, views: Views) -> Events:
-        """Order the epochs, samples and frames up to the end of a call, with the motions to them."""
-        epochs_ns, reached_ns = self.odometry.epochs_reached(self.node_ns, call.end_ns)
-        order = Order(*in_order(epochs_ns, reached_ns, samples.stamp_ns, samples.kind, views, call))
-        motions = self.odometry.motions(order.start_ns, order.end_ns, order.stamp_ns, NO_BIAS)
-        is_reduced = np.full(len(order.kind), not self._has_rate)
-        gravity = self._gravity(order.end_ns[order.interval >= 0].tolist())
-        may_be_far = self.params.far_views and self._was_lost
-        return Events(order, motions, is_reduced, gravity, samples, views, may_be_far)
+    def _reduced(self, motion: Motion) -> Motion:
+        """The motion without the gyro bias of the state and the Earth's rate."""
+        if not self._has_rate:
+            return motion
+        return remove_rate(motion, self.gyro_bias(), self.attitude().T @ self.model.earth)
 
-    def _gravity(self, epochs_ns: list[int]) -> Floats:
-        """Intervals of gravity that end at epochs, as `Events.gravity`."""
-        intervals = []
-        for epoch_ns in epochs_ns:
-            duration_s = (epoch_ns - self._opened_ns) * 1e-9
-            velocity_i, variance_i = self._opened_velocity
-            velocity_j, variance_j = self._opened_velocity = self.odometry.velocity_at_imu(epoch_ns)
+    def _to_epoch(self, motion: Motion, epoch_ns: int, *, ends_interval: bool) -> None:
+        """Predict to an epoch, and correct there by the plane, and by gravity where an interval of it ends."""
+        self.predict(motion, (epoch_ns - self.node_ns) * 1e-9)
+        self.node_ns = epoch_ns
+        self._impulse = self._impulse + self._turned @ motion.impulse
+        self._turned = self._turned @ motion.dR
+        if self.calibration.planar is not None:
+            self.update_plane()
+        if ends_interval:
+            self._level(epoch_ns)
+
+    def _level(self, epoch_ns: int) -> None:
+        """Update by gravity over the interval that ends at an epoch; the next one begins."""
+        duration_s = (epoch_ns - self._opened_ns) * 1e-9
+        velocity_i, variance_i = self._opened_velocity
+        velocity_j, variance_j = self.odometry.velocity_at_imu(epoch_ns)
+        up = up_direction(self._impulse / duration_s, self._turned, velocity_i, velocity_j, duration_s)
+        if not math.isnan(up[0]):
             velocity_sigma = math.sqrt(0.5 * (variance_i + variance_j))
-            sigma = tilt_sigma(duration_s, velocity_sigma, self.calibration, has_bias=not self.has_bias)
-            intervals.append((*velocity_i.tolist(), *velocity_j.tolist(), duration_s, sigma))
-            self._opened_ns = epoch_ns
-        return np.array(intervals) if intervals else NO_GRAVITY
+            sigma_rad = tilt_sigma(duration_s, velocity_sigma, self.calibration, has_bias=not self.has_bias)
+            self.update_up(up, sigma_rad, self._turned)
+        self._opened_ns = epoch_ns
+        self._opened_velocity = (velocity_j, variance_j)
+        self._turned = np.eye(3)
+        self._impulse = np.zeros(3)
 
-    def _use(self, events: Events) -> tuple[int, Motion]:
-        """Use all events; the number of the last, `END`, and the motion to it."""
-        k = self.advance(events, 0)
-        while math.isnan(events.motions.dp[k, 0]):
-            events = self._bridge(events, k)
-            k = self.advance(events, k)
-        samples = events.samples
-        for kind in (HEADING, FIX):
-            distances = samples.distance[samples.kind == kind]
-            if len(distances):
-                self._contradictions.judge(SENSORS[kind], distances)
-        return k, Motion(*(column[k] for column in events.motions))
+    def _see(self, motion: Motion, views: Views, first: int) -> None:
+        """Update by the known landmarks of a frame and append the new ones, in the order of their rows."""
+        for row in in_frame(views, first):
+            z = views.z[row]
+            R_z = views.R_z[row]
+            slot = int(views.slot[row])
+            if slot == self._landmarks:
+                self.augment(motion, z, R_z)
+                self._landmarks += 1
+                views.outcome[row] = NEW
+                continue
+            judged = self.observe_far(motion, slot, z, R_z) if self._may_be_far else None
+            judged = judged or self.observe(motion, slot, z, R_z)
+            views.outcome[row], views.e[row], views.S[row] = judged
 
-    def _bridge(self, events: Events, k: int) -> Events:
-        """Write the motion over a gap, with the share of its error that the measurements of one more event may have.
+    def _bridge(self, order: Order, k: int, views: Views) -> Motion:
+        """Motion over a gap, with the share of its error that the measurements of one more event may have.
 
         Measurements that are related to one epoch over the same gap of the Doppler log share its error. The k-th gets
         ``k (k + 1)`` times the motion's covariance: together those of one kind, such as depths or detections, inform no
@@ -412,61 +473,68 @@ class FilterShell(ABC):
 
         In a state without bias an unknown one, which tilts gravity, adds to the covariance of the displacement.
         """
-        order = events.order
-        start_ns = int(order.start_ns[k])
         kind = int(order.kind[k])
+        end_ns = int(order.end_ns[k])
         over = self.odometry.motion(
-            start_ns, int(order.end_ns[k]), self.gyro_bias(), self.attitude(), int(order.stamp_ns[k])
+            self.node_ns, end_ns, self.gyro_bias(), self.attitude(), int(order.stamp_ns[k])
         )
-        C = over.covariance.copy()
-        D = over.D_bias
-        if not self.has_bias:
-            C[3:, 3:] += self.calibration.imu.gyro_bias_sigma**2 * D[3:] @ D[3:].T
-        if DEPTH <= kind <= FRAME:
-            views = events.views
-            in_frame = (views.stamp_ns == order.stamp_ns[k]) & (views.outcome == ACCEPTED)
-            more = int(np.count_nonzero(in_frame)) if kind == FRAME else 1
-            count = self._used_in_gap.get((start_ns, kind), 0) + more
-            self._used_in_gap[start_ns, kind] = count
-            C *= count * (count + 1)
-        motion = Motion(
-            over.i_T_j.rotation().matrix(), over.i_T_j.translation(), C, D, over.mean_specific_force * over.duration_s
-        )
+        motion = motion_of(over)
         if not np.isfinite(motion.dp).all():
-            raise EstimatorError(f"{self.name}: the motion to {order.end_ns[k]} ns over a gap is not finite")
-        for column, part in zip(events.motions, motion, strict=True):
-            column[k] = part
-        events.is_reduced[k] = True
-        if kind == END:  # an estimate alone changes nothing
-            return events
-        self._was_lost = True
-        return events._replace(may_be_far=self.params.far_views)
+            raise EstimatorError(f"{self.name}: the motion to {end_ns} ns over a gap is not finite")
+        C = motion.C.copy()
+        if not self.has_bias:
+            C[3:, 3:] += self.calibration.imu.gyro_bias_sigma**2 * motion.D[3:] @ motion.D[3:].T
+        if kind in (DEPTH, HEADING, FIX, FRAME):
+            more = len(in_frame(views, int(order.row[k]))) if kind == FRAME else 1
+            count = self._used_in_gap.get((self.node_ns, kind), 0) + more
+            self._used_in_gap[self.node_ns, kind] = count
+            C *= count * (count + 1)
+        if kind != END:  # an estimate alone changes nothing
+            self._may_be_far = self.params.far_views
+        return motion._replace(C=C)
 
-    def _use_late(self, fix: Samples, since_ns: int) -> None:
+    def _use_late(self, stamp_ns: int, position_m: Floats, noise: Floats, since_ns: int) -> None:
         """Update by a fix of an earlier instant i, by the motion backwards.
 
         From epoch j the antenna was then at ``j_T_i l``, with covariance ``Ad(i_T_j) C Ad(i_T_j)^T``. The state
         shares the error of this motion, which is left out: the fix informs rather too little.
         """
-        stamp_ns = int(fix.stamp_ns[0])
         first_ns = min(stamp_ns, self.node_ns)
         last_ns = max(stamp_ns, self.node_ns)
-        bias = self.gyro_bias()
         attitude = self.attitude()
-        between = self.odometry.motion(first_ns, last_ns, bias, attitude, since_ns)
-        T = between.i_T_j
-        C = between.covariance
-        D = between.D_bias
+        between = self.odometry.motion(first_ns, last_ns, self.gyro_bias(), attitude, since_ns)
+        motion = motion_of(between)
         if stamp_ns < self.node_ns:
-            # the attitude is that at the end of the motion
-            attitude = attitude @ T.rotation().matrix().T
-            between = self.odometry.motion(first_ns, last_ns, bias, attitude, since_ns)
-            A = between.i_T_j.AdjointMap()
-            T = between.i_T_j.inverse()
-            C = A @ between.covariance @ A.T
-            D = -A @ between.D_bias
-        motion = Motion(np.ascontiguousarray(T.rotation().matrix()), T.translation(), C, D, NO_BIAS)
-        self._use(one_event(FIX, motion, stamp_ns, fix))
+            # the attitude is that at the end of the motion: take it back to the start
+            attitude = attitude @ motion.dR.T
+            between = self.odometry.motion(first_ns, last_ns, self.gyro_bias(), attitude, since_ns)
+            motion = backwards(between)
+        distance = self.update_body(motion, FIX, position_m, noise)
+        self._contradictions.judge(SENSORS[FIX], distance)
+
+
+def motion_of(over: PreintegratedMotion) -> Motion:
+    """The motion as arrays."""
+    return Motion(
+        dR=np.ascontiguousarray(over.i_T_j.rotation().matrix()),
+        dp=over.i_T_j.translation(),
+        C=over.covariance,
+        D=over.D_bias,
+        impulse=over.mean_specific_force * over.duration_s,
+    )
+
+
+def backwards(over: PreintegratedMotion) -> Motion:
+    """The motion from its end to its start, with covariance and derivative; without the specific force."""
+    A = over.i_T_j.AdjointMap()
+    back = over.i_T_j.inverse()
+    return Motion(
+        dR=np.ascontiguousarray(back.rotation().matrix()),
+        dp=back.translation(),
+        C=A @ over.covariance @ A.T,
+        D=-A @ over.D_bias,
+        impulse=np.full(3, math.nan),
+    )
 
 
 OUTLYING = math.sqrt(-2.0 * math.log(0.001))
@@ -500,24 +568,9 @@ SENSORS = {DEPTH: "depth", HEADING: "heading", FIX: "positions"}
 """Names in `RefusedRow`."""
 
 
-def one_event(kind: int, motion: Motion, stamp_ns: int, samples: Samples) -> Events:
-    """An event at the end of a motion without gyro bias and Earth's rate, and the end of the call."""
-    stamps_ns = np.full(2, stamp_ns)
-    order = Order(
-        stamp_ns=stamps_ns,
-        start_ns=stamps_ns,
-        end_ns=stamps_ns,
-        kind=np.array([kind, END]),
-        row=np.zeros(2, np.int64),
-        interval=np.full(2, -1),
-    )
-    motions = Motions(*(np.array([part, part]) for part in motion))
-    return Events(order, motions, np.ones(2, np.bool_), NO_GRAVITY, samples, NO_VIEWS, may_be_far=False)
-
-
 def _samples(stamps_ns: Ints, kind: int, value: Floats, noise: Floats) -> Samples:
     n = len(stamps_ns)
-    return Samples(stamps_ns, np.full(n, kind), value, noise, np.full(n, math.nan))
+    return Samples(stamps_ns, np.full(n, kind), value, noise)
 
 
 def _rows(samples: Samples, selection: slice | NDArray[np.bool_]) -> Samples:

@@ -48,29 +48,11 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from baselines.events import (
-    DEPTH,
-    END,
-    EPOCH,
-    FIX,
-    FRAME,
-    HEADING,
-    Events,
-    Interval,
-    Model,
-    Motion,
-    Samples,
-    Views,
-    body_measurement,
-    elevation_of_new,
-    extend,
-    motion_to,
-    up_at_end,
-)
+from baselines.events import DEPTH, HEADING, Model, Motion, body_measurement, elevation_of_new
 from baselines.filter import FilterParams, FilterShell
 from baselines.kalman import (
     GATED,
-    NEW,
+    Judged,
     bordered,
     correction,
     distance,
@@ -85,7 +67,6 @@ from sonar_graph.calibration import Calibration, Section
 from sonar_graph.measurements import Floats
 from sonar_graph.models import (
     ACCEL,
-    ACCEPTED,
     BIASES,
     COMPASS,
     FLOOR_GATE,
@@ -179,14 +160,15 @@ def update(state: InvariantState, H: Floats, e: Floats, R: Floats) -> None:
 
 
 @compiled
-def observe(state: InvariantState, motion: Motion, model: Model, views: Views, row: int) -> None:
-    """Update by range and azimuth of a known landmark, (5); write outcome, innovation and its covariance."""
-    k = 1 + views.slot[row]
+def observe(
+    state: InvariantState, k: int, motion: Motion, model: Model, z: Floats, R_z: Floats
+) -> tuple[int, Floats, Floats]:
+    """Update by range and azimuth of a known landmark, (5); outcome, innovation and its covariance."""
     at = BODY.start + POINT * k
-    R_z = views.R_z[row]
+    sonar = model.sonar
     R, X, D = pose_after(state, motion, model)
-    z_hat, H_b, H_p = view_from_body(R, X, model.mount, state.points[k])
-    e = views.z[row] - z_hat
+    z_hat, H_b, H_p = view_from_body(R, X, sonar.mount, state.points[k])
+    e = z - z_hat
     e[1] = wrap_angle(e[1])
     H = np.zeros((2, len(state.P)))
     H[:, at : at + POINT] = H_p
@@ -194,26 +176,23 @@ def observe(state: InvariantState, motion: Motion, model: Model, views: Views, r
     H[:, BETA] = H_b @ D  # (4)
     noise = H_b @ motion.C @ H_b.T + R_z
     S = symmetric(H @ state.P @ H.T + noise)  # (9)
-    outcome, widened = judged(e, S, R_z, model.gate, model.kernel_width)
-    views.outcome[row] = outcome
-    views.e[row] = e
-    views.S[row] = S
+    outcome, widened = judged(e, S, R_z, sonar.gate, sonar.kernel_width)
     if outcome != GATED:
         update(state, H, e, noise + widened)
+    return outcome, e, S
 
 
-@compiled
-def observe_far(state: InvariantState, motion: Motion, model: Model, views: Views, row: int) -> bool:
-    """Update as `observe` by a landmark far from where it is predicted, by the point seen, (6); False if it is near.
+def observe_far(
+    state: InvariantState, k: int, motion: Motion, model: Model, z: Floats, R_z: Floats
+) -> Judged | None:
+    """Update as `observe` by a landmark far from where it is predicted, by the point seen, (6); None if it is near.
 
     Exp(theta) turns both points: the innovation is ``xi_k - xi_new``, without theta however far they are apart.
     """
-    k = 1 + views.slot[row]
     at = BODY.start + POINT * k
-    z = views.z[row]
-    R_z = views.R_z[row]
+    sonar = model.sonar
     R, X, D = pose_after(state, motion, model)
-    g, G_b, G_z = locate_from_body(R, X, model.mount, z, 0.0)
+    g, G_b, G_z = locate_from_body(R, X, sonar.mount, z, 0.0)
     e = g - state.points[k]
     H = np.zeros((POINT, len(state.P)))
     H[:, at : at + POINT] = np.eye(3)
@@ -222,43 +201,44 @@ def observe_far(state: InvariantState, motion: Motion, model: Model, views: View
     noise = G_b @ motion.C @ G_b.T
     S = H @ state.P @ H.T + noise
     if not is_far(S, G_z, z[0], R_z):
-        return False
-    V = G_z @ far_covariance(R_z, z[0], model.aperture_rad) @ G_z.T
-    outcome, e_z, S_z, widened = judged_far(e, symmetric(S + V), G_z, R_z, model.gate, model.kernel_width)
-    views.outcome[row] = outcome
-    views.e[row] = e_z
-    views.S[row] = symmetric(S_z)
+        return None
+    V = G_z @ far_covariance(R_z, z[0], sonar.aperture_rad) @ G_z.T
+    outcome, e_z, S_z, widened = judged_far(e, symmetric(S + V), G_z, R_z, sonar.gate, sonar.kernel_width)
     if outcome != GATED:
         update(state, H, e, symmetric(noise + V + widened))
-    return True
+    return Judged(outcome, e_z, symmetric(S_z))
 
 
 @compiled
-def update_body(state: InvariantState, motion: Motion, model: Model, samples: Samples, row: int) -> None:
-    """Update by a depth or a position fix, (7), or a heading, (10), the latter two with Huber's kernel."""
-    kind = samples.kind[row]
+def update_body(
+    state: InvariantState, motion: Motion, model: Model, kind: int, value: Floats, noise: Floats
+) -> float:
+    """Update by a depth or a position fix, (7), or a heading, (10), the latter two with Huber's kernel.
+
+    Returns the distance from the estimate in sigmas, where the bias of the compass counts as noise.
+    """
     R, X, D = pose_after(state, motion, model)
-    e, H_b, R_z = body_measurement(R, X, model, samples, row)
+    arm = model.port if kind == DEPTH else model.antenna
+    e, H_b, R_z = body_measurement(R, X, kind, arm, value, noise)
     H = np.zeros((len(e), len(state.P)))
-    noise = H_b @ motion.C @ H_b.T
     if kind == HEADING:
-        e[0] = wrap_angle(e[0])
         H[:, THETA] = H_b[:, :3].copy() @ R.T
     else:
-        first = 2 if kind == DEPTH else 0
-        a = X + R @ (model.port if kind == DEPTH else model.antenna)
-        H[:, THETA] = -cross_matrix(a)[first:]
-        H[:, BODY] = np.eye(3)[first:]
+        H[:, THETA] = -cross_matrix(X + R @ arm)[-len(e) :]  # of a depth the last row
+        H[:, BODY] = np.eye(3)[-len(e) :]
     H[:, BETA] = H_b @ D  # (4)
+    R_b = H_b @ motion.C @ H_b.T + R_z
+    S = H @ state.P @ H.T + R_b  # (9)
     if kind == HEADING:
-        samples.distance[row] = distance(e, H @ state.P @ H.T + noise + R_z + model.compass_variance_rad2)
+        off = distance(e, S + model.compass_variance_rad2)
         e[0] = wrap_angle(e[0] - state.bias[COMPASS])
         H[0, BETA_COMPASS] = 1.0
-    S = H @ state.P @ H.T + noise + R_z  # (9)
-    if kind == FIX:
-        samples.distance[row] = distance(e, S)
+        S = H @ state.P @ H.T + R_b
+    else:
+        off = distance(e, S)
     scale = 1.0 if kind == DEPTH else huber_scale(e, S)
-    update(state, H, e, noise + scale * R_z)
+    update(state, H, e, R_b + (scale - 1.0) * R_z)
+    return off
 
 
 @compiled
@@ -283,7 +263,6 @@ def height_jacobian(state: InvariantState, k: int) -> Floats:
     return H
 
 
-@compiled
 def update_plane(state: InvariantState, plane: Floats) -> None:
     """Update by the plane on which the vehicle stays: height of the body, (7), and tilt, (8)."""
     update(state, height_jacobian(state, 0), plane[0] - state.points[0, 2:], plane[1] * np.eye(1))
@@ -293,77 +272,25 @@ def update_plane(state: InvariantState, plane: Floats) -> None:
 # -------------------------------------------------------------------------------- augmentation
 
 
-@compiled
 def augment(state: InvariantState, motion: Motion, model: Model, z: Floats, R_z: Floats) -> InvariantState:
     """State with a new landmark, (6), on a floor of known height if it is near."""
+    sonar = model.sonar
     R, X, D = pose_after(state, motion, model)
-    g, G_b, G_z = locate_from_body(R, X, model.mount, z, elevation_of_new(R, X, model, z))
+    g, G_b, G_z = locate_from_body(R, X, sonar.mount, z, elevation_of_new(R, X, sonar, z))
     G = np.zeros((POINT, len(state.P)))
     G[:, BODY] = np.eye(3)
     G[:, BETA] = G_b @ D  # (4)
     GP = G @ state.P
-    V = G_z @ polar_covariance(R_z, model.aperture_rad) @ G_z.T
+    V = G_z @ polar_covariance(R_z, sonar.aperture_rad) @ G_z.T
     P = bordered(state.P, GP, symmetric(GP @ G.T + G_b @ motion.C @ G_b.T + V))
     state = InvariantState(state.R, np.concatenate((state.points, g.reshape(1, 3))), state.bias, P)
     k = len(state.points) - 1
     H = height_jacobian(state, k)
-    e = model.floor_z_m - state.points[k, 2:]  # NaN where the floor is not known
-    noise = model.floor_variance_m2 * np.eye(1)
+    e = sonar.floor_z_m - state.points[k, 2:]  # NaN where the floor is not known
+    noise = sonar.floor_variance_m2 * np.eye(1)
     if e[0] ** 2 <= FLOOR_GATE * (H @ P @ H.T + noise)[0, 0]:
         update(state, H, e, noise)
     return state
-
-
-# -------------------------------------------------------------------------------- the filter
-
-
-@compiled
-def see(state: InvariantState, motion: Motion, model: Model, events: Events, first: int) -> InvariantState:
-    """Update by the known landmarks of a frame, and append the new ones, in the order of their rows."""
-    views = events.views
-    row = first
-    while row < len(views.stamp_ns) and views.stamp_ns[row] == views.stamp_ns[first]:
-        if views.outcome[row] == ACCEPTED:
-            if 1 + views.slot[row] == len(state.points):
-                state = augment(state, motion, model, views.z[row], views.R_z[row])
-                views.outcome[row] = NEW
-            elif not (events.may_be_far and observe_far(state, motion, model, views, row)):
-                observe(state, motion, model, views, row)
-        row += 1
-    return state
-
-
-@compiled
-def advance(
-    state: InvariantState, interval: Interval, model: Model, events: Events, k: int
-) -> tuple[InvariantState, int]:
-    """Use the events from k on, up to a gap of the Doppler log or the end of the call; state and that event's number."""
-    order = events.order
-    while not math.isnan(events.motions.dp[k, 0]):
-        bias = gyro_bias_of(state.bias, up_in_body(state, model))
-        motion = motion_to(events, k, bias, state.R.T @ model.earth)
-        kind = order.kind[k]
-        row = order.row[k]
-        if kind == END:
-            break
-        if kind == EPOCH:
-            predict(state, motion, model, (order.end_ns[k] - order.start_ns[k]) * 1e-9)
-            extend(interval, motion)
-            if model.is_planar:
-                update_plane(state, model.plane)
-            if order.interval[k] >= 0:
-                # the accelerometers' bias is constant in the body, which turns meanwhile
-                mean_R = 0.5 * (np.eye(3) + interval.i_R_j.T)
-                ends = events.gravity[order.interval[k]]
-                up = up_at_end(interval, ends)
-                if not math.isnan(up[0]):
-                    update_up(state, up, mean_R / model.gravity_m_s2, ends[7])
-        elif kind == FRAME:
-            state = see(state, motion, model, events, row)
-        else:
-            update_body(state, motion, model, events.samples, row)
-        k += 1
-    return state, k
 
 
 class InvariantEkfParams(FilterParams):
@@ -412,10 +339,35 @@ class InvariantEkf(FilterShell):
         """Stamp (ns) and a copy of the state at the newest epoch."""
         return self.node_ns, InvariantState(*(part.copy() for part in self._state))
 
-    def advance(self, events: Events, k: int) -> int:
-        """Use the events from k on, up to a gap or the end of the call."""
-        self._state, k = advance(self._state, self.interval, self.model, events, k)
-        return k
+    def predict(self, motion: Motion, duration_s: float) -> None:
+        """Carry the state over the motion to the next epoch, (2) and (3)."""
+        predict(self._state, motion, self.model, duration_s)
+
+    def observe(self, motion: Motion, slot: int, z: Floats, R_z: Floats) -> Judged:
+        """Update by range and azimuth of a known landmark, (5)."""
+        return Judged(*observe(self._state, 1 + slot, motion, self.model, z, R_z))
+
+    def observe_far(self, motion: Motion, slot: int, z: Floats, R_z: Floats) -> Judged | None:
+        """Update by a landmark that may be far from where it is predicted, (6)."""
+        return observe_far(self._state, 1 + slot, motion, self.model, z, R_z)
+
+    def augment(self, motion: Motion, z: Floats, R_z: Floats) -> None:
+        """Append a landmark, (6)."""
+        self._state = augment(self._state, motion, self.model, z, R_z)
+
+    def update_body(self, motion: Motion, kind: int, value: Floats, noise: Floats) -> float:
+        """Update by a depth, a heading or a position fix, (7) and (10)."""
+        return update_body(self._state, motion, self.model, kind, value, noise)
+
+    def update_up(self, up: Floats, sigma_rad: float, i_R_j: Floats) -> None:
+        """Update by the direction of the world's up, (8)."""
+        # the accelerometers' bias is constant in the body, which turns from i to j
+        by_accel = 0.5 * (np.eye(3) + i_R_j.T) / self.calibration.gravity_m_s2
+        update_up(self._state, up, by_accel, sigma_rad)
+
+    def update_plane(self) -> None:
+        """Update by the plane on which the vehicle stays, (7) and (8)."""
+        update_plane(self._state, self.model.plane)
 
     def attitude(self) -> Floats:
         """world_R_body of the state, shape (3, 3)."""

@@ -4,6 +4,7 @@ Derivation: docs/theory/fair_comparison.md (gate, kernel), docs/theory/gaps.md (
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,6 +15,17 @@ from sonar_graph.states import OUTCOME_NUMBERS, Outcome
 USED = OUTCOME_NUMBERS[Outcome.USED]
 GATED = OUTCOME_NUMBERS[Outcome.GATED]
 NEW = OUTCOME_NUMBERS[Outcome.NEW]
+
+
+class Judged(NamedTuple):
+    """Range and azimuth of a known landmark, after the update."""
+
+    outcome: int
+    """`USED` or `GATED`."""
+    e: Floats
+    """Innovation, shape (2,)."""
+    S: Floats
+    """Covariance of the innovation, shape (2, 2)."""
 
 
 @compiled
@@ -39,7 +51,6 @@ def symmetric(A: Floats) -> Floats:
     return 0.5 * (A + A.T)
 
 
-@compiled
 def bordered(P: Floats, P_pv: Floats, P_pp: Floats) -> Floats:
     """``[ P  P_pv^T ; P_pv  P_pp ]``."""
     n = len(P)
@@ -70,7 +81,6 @@ def judged(e: Floats, S: Floats, R_z: Floats, gate: float, kernel_width: float) 
     return USED, (np.outer(spread, spread) - 1.0) * R_z
 
 
-@compiled
 def is_far(cov: Floats, G_z: Floats, range_m: float, R_z: Floats) -> bool:
     """Check that a view linearised at the predicted place errs by more than its noise.
 
@@ -91,7 +101,6 @@ def is_far(cov: Floats, G_z: Floats, range_m: float, R_z: Floats) -> bool:
     return L > 2.0 * range_m * math.sqrt(R_z[0, 0]) or L * A > range_m**4 * R_z[1, 1]
 
 
-@compiled
 def polar_covariance(R_z: Floats, aperture_rad: float) -> Floats:
     """Covariance of range, azimuth and elevation (3, 3); the latter is uniform in the aperture: ``aperture^2 / 12``."""
     V = np.zeros((3, 3))
@@ -100,7 +109,6 @@ def polar_covariance(R_z: Floats, aperture_rad: float) -> Floats:
     return V
 
 
-@compiled
 def far_covariance(R_z: Floats, range_m: float, aperture_rad: float) -> Floats:
     """`polar_covariance` of a point at elevation 0: a beam that is not level reaches ``r e^2 / 2`` less far."""
     V = polar_covariance(R_z, aperture_rad)
@@ -108,7 +116,6 @@ def far_covariance(R_z: Floats, range_m: float, aperture_rad: float) -> Floats:
     return V
 
 
-@compiled
 def judged_far(
     e: Floats, S: Floats, G_z: Floats, R_z: Floats, gate: float, kernel_width: float
 ) -> tuple[int, Floats, Floats, Floats]:
