@@ -23,7 +23,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from baselines.events import DEPTH, HEADING, Model, Motion, Sonar, body_measurement, elevation_of_new
+from baselines.events import Motion, Sonar, elevation_of_new
 from baselines.filter import FilterParams, FilterShell
 from baselines.kalman import (
     GATED,
@@ -38,14 +38,16 @@ from baselines.kalman import (
     polar_covariance,
     symmetric,
 )
-from sonar_graph.calibration import Calibration, Section
+from sonar_graph.calibration import Calibration, PlanarMotion, Section
 from sonar_graph.measurements import Floats
 from sonar_graph.models import (
     FLOOR_GATE,
+    body_point_jacobian,
     huber_scale,
     locate_from_body,
     view_from_body,
     wrap_angle,
+    yaw_and_derivative,
 )
 from sonar_graph.motion import MotionSource
 from sonar_graph.numerics import compiled, cross_matrix
@@ -63,8 +65,12 @@ MOST_PITCH_RAD = 0.5 * math.pi - 1e-3
 @compiled
 def rotation_from_euler(angles: Floats) -> Floats:
     """``world_R_body = Rz(psi) Ry(theta) Rx(phi)``, shape (3, 3)."""
-    sr, sp, sy = np.sin(angles)
-    cr, cp, cy = np.cos(angles)
+    sr = math.sin(angles[0])
+    cr = math.cos(angles[0])
+    sp = math.sin(angles[1])
+    cp = math.cos(angles[1])
+    sy = math.sin(angles[2])
+    cy = math.cos(angles[2])
     return np.array(
         [
             [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
@@ -85,8 +91,10 @@ def euler_from_rotation(R: Floats) -> Floats:
 @compiled
 def body_rates_from_euler(angles: Floats) -> Floats:
     """W: body rates are ``w = W (phi', theta', psi')^T``, shape (3, 3)."""
-    sr, sp, _ = np.sin(angles)
-    cr, cp, _ = np.cos(angles)
+    sr = math.sin(angles[0])
+    cr = math.cos(angles[0])
+    sp = math.sin(angles[1])
+    cp = math.cos(angles[1])
     return np.array([[1.0, 0.0, -sp], [0.0, cr, sr * cp], [0.0, -sr, cr * cp]])
 
 
@@ -177,32 +185,51 @@ def observe_far(
 
 
 @compiled
-def update_body(
-    x: Floats, P: Floats, motion: Motion, model: Model, kind: int, value: Floats, noise: Floats
-) -> float:
-    """Update by a depth, a heading or a position fix, the latter two with Huber's kernel.
-
-    Returns the distance from the estimate in sigmas, where the bias of the compass counts as noise.
-    """
+def update_depth(x: Floats, P: Floats, motion: Motion, port: Floats, z_m: float, variance_m2: float) -> None:
+    """Update by the height of the pressure port, ``(X' + R' q)_z``."""
     R, X, T = pose_after(x, motion)
-    e, H_b, R_z = body_measurement(R, X, kind, model.port if kind == DEPTH else model.antenna, value, noise)
-    H = np.zeros((len(e), len(x)))
+    H_b = body_point_jacobian(R, port)[2:]  # (1, 6)
+    H = np.zeros((1, len(x)))
     H[:, :POSE] = H_b @ T
-    R_b = H_b @ motion.C @ H_b.T + R_z
-    S = H @ P @ H.T + R_b
-    if kind == HEADING:
-        off = distance(e, S + model.compass_variance_rad2)
-        e[0] = wrap_angle(e[0] - x[COMPASS])
-        H[0, COMPASS] = 1.0
-        S = H @ P @ H.T + R_b
-    else:
-        off = distance(e, S)
-    scale = 1.0 if kind == DEPTH else huber_scale(e, S)
-    update(x, P, H, e, R_b + (scale - 1.0) * R_z)
+    e = z_m - (X + R @ port)[2:]
+    update(x, P, H, e, H_b @ motion.C @ H_b.T + variance_m2)
+
+
+def update_heading(
+    x: Floats, P: Floats, motion: Motion, yaw_rad: float, variance_rad2: float, bias_variance_rad2: float
+) -> float:
+    """Update by a compass, ``psi' + c``, with Huber's kernel.
+
+    Returns the distance from the yaw in sigmas, in which the bias of the compass is noise of the calibration's variance.
+    """
+    R, _, T = pose_after(x, motion)
+    yaw, by_turn = yaw_and_derivative(R)
+    H_b = np.zeros((1, 6))
+    H_b[0, :3] = by_turn
+    H = np.zeros((1, len(x)))
+    H[:, :POSE] = H_b @ T
+    noise = H_b @ motion.C @ H_b.T
+    off = distance(np.array([wrap_angle(yaw_rad - yaw)]), H @ P @ H.T + noise + variance_rad2 + bias_variance_rad2)
+    H[0, COMPASS] = 1.0
+    e = np.array([wrap_angle(yaw_rad - yaw - x[COMPASS])])
+    scale = huber_scale(e, H @ P @ H.T + noise + variance_rad2)
+    update(x, P, H, e, noise + scale * variance_rad2)
     return off
 
 
-@compiled
+def update_position(x: Floats, P: Floats, motion: Motion, q: Floats, position_m: Floats, R_z: Floats) -> float:
+    """Update by the position of a point q of the body, ``X' + R' q``, with Huber's kernel; the distance in sigmas."""
+    R, X, T = pose_after(x, motion)
+    H_b = body_point_jacobian(R, q)  # (3, 6)
+    H = np.zeros((3, len(x)))
+    H[:, :POSE] = H_b @ T
+    e = position_m - (X + R @ q)
+    noise = H_b @ motion.C @ H_b.T
+    S = symmetric(H @ P @ H.T + noise + R_z)
+    update(x, P, H, e, noise + huber_scale(e, S) * R_z)
+    return distance(e, S)
+
+
 def update_up(x: Floats, P: Floats, up: Floats, sigma_rad: float) -> None:
     """Update roll and pitch by the direction of the world's up in the body, with the sigma of its tilt."""
     level = math.hypot(up[1], up[2])
@@ -213,14 +240,14 @@ def update_up(x: Floats, P: Floats, up: Floats, sigma_rad: float) -> None:
     update(x, P, H, e, np.diag(np.array([(sigma_rad / level) ** 2, sigma_rad**2])))
 
 
-def update_plane(x: Floats, P: Floats, plane: Floats) -> None:
+def update_plane(x: Floats, P: Floats, plane: PlanarMotion) -> None:
     """Update Z, roll and pitch by the plane on which the vehicle stays."""
     H = np.zeros((3, len(x)))
     H[0, Z] = 1.0
     H[1, ROLL] = 1.0
     H[2, PITCH] = 1.0
-    e = np.array([plane[0] - x[Z], -x[ROLL], -x[PITCH]])
-    update(x, P, H, e, np.diag(np.array([plane[1], plane[2], plane[2]])))
+    e = np.array([plane.z_m - x[Z], -x[ROLL], -x[PITCH]])
+    update(x, P, H, e, np.diag(np.square([plane.z_sigma_m, plane.tilt_sigma_rad, plane.tilt_sigma_rad])))
 
 
 # -------------------------------------------------------------------------------- augmentation
@@ -300,33 +327,42 @@ class EkfSlam(FilterShell):
         """Stamp (ns), x of equation (4) and P of (5) at the newest epoch; copies."""
         return self.node_ns, self._x.copy(), self._P.copy()
 
-    def predict(self, motion: Motion, duration_s: float) -> None:  # noqa: ARG002  # the bias of other filters walks
+    def predict(self, motion: Motion, duration_s: float) -> None:  # noqa: ARG002  # nothing walks
         """Carry the state over the motion to the next epoch."""
         predict(self._x, self._P, motion)
 
     def observe(self, motion: Motion, slot: int, z: Floats, R_z: Floats) -> Judged:
         """Update by range and azimuth of a known landmark, (6) and (7)."""
-        return Judged(*observe(self._x, self._P, MAP + LANDMARK * slot, motion, self.model.sonar, z, R_z))
+        return Judged(*observe(self._x, self._P, MAP + LANDMARK * slot, motion, self.sonar, z, R_z))
 
     def observe_far(self, motion: Motion, slot: int, z: Floats, R_z: Floats) -> Judged | None:
         """Update by a landmark that may be far from where it is predicted."""
-        return observe_far(self._x, self._P, MAP + LANDMARK * slot, motion, self.model.sonar, z, R_z)
+        return observe_far(self._x, self._P, MAP + LANDMARK * slot, motion, self.sonar, z, R_z)
 
     def augment(self, motion: Motion, z: Floats, R_z: Floats) -> None:
         """Append a landmark to (4) and (5)."""
-        self._x, self._P = augment(self._x, self._P, motion, self.model.sonar, z, R_z)
+        self._x, self._P = augment(self._x, self._P, motion, self.sonar, z, R_z)
 
-    def update_body(self, motion: Motion, kind: int, value: Floats, noise: Floats) -> float:
-        """Update by a depth, a heading or a position fix."""
-        return update_body(self._x, self._P, motion, self.model, kind, value, noise)
+    def update_depth(self, motion: Motion, z_m: float, variance_m2: float) -> None:
+        """Update by the height of the pressure port."""
+        update_depth(self._x, self._P, motion, self.port, z_m, variance_m2)
+
+    def update_heading(self, motion: Motion, yaw_rad: float, variance_rad2: float) -> float:
+        """Update by the yaw of the body and the compass' bias."""
+        bias_variance_rad2 = self.calibration.heading.bias_sigma_rad**2
+        return update_heading(self._x, self._P, motion, yaw_rad, variance_rad2, bias_variance_rad2)
+
+    def update_position(self, motion: Motion, position_m: Floats, cov_m2: Floats) -> float:
+        """Update by the position of the antenna."""
+        return update_position(self._x, self._P, motion, self.antenna, position_m, cov_m2)
 
     def update_up(self, up: Floats, sigma_rad: float, i_R_j: Floats) -> None:  # noqa: ARG002  # (4) has no bias
         """Update roll and pitch by the direction of the world's up."""
         update_up(self._x, self._P, up, sigma_rad)
 
-    def update_plane(self) -> None:
+    def update_plane(self, plane: PlanarMotion) -> None:
         """Update Z, roll and pitch by the plane on which the vehicle stays."""
-        update_plane(self._x, self._P, self.model.plane)
+        update_plane(self._x, self._P, plane)
 
     def pose_after(self, motion: Motion) -> tuple[Floats, Floats, Floats]:
         """world_R_body (3, 3), position (3,), and covariance of [theta, rho] (6, 6) a motion after the state."""

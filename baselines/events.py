@@ -10,13 +10,14 @@ no later::
     t' ------ i                  position fix that comes late, by the motion backwards
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sonar_graph.measurements import Floats, Ints
-from sonar_graph.models import ACCEPTED, Mount, body_point_jacobian, floor_elevation, wrap_angle, yaw_and_derivative
+from sonar_graph.models import ACCEPTED, Mount, floor_elevation
 from sonar_graph.numerics import compiled, cross_matrix, rotation_exp
 
 EPOCH, DEPTH, HEADING, FIX, FRAME, END = range(6)
@@ -51,28 +52,6 @@ class Sonar(NamedTuple):
     """Mahalanobis distance beyond which a detection is refused."""
     kernel_width: float
     """Of the Cauchy kernel, in standard deviations; infinite: none."""
-
-
-class Model(NamedTuple):
-    """Numbers of the calibration and the settings that the equations of both filters need."""
-
-    sonar: Sonar
-    port: Floats
-    """Pressure port in the body, shape (3,), m."""
-    antenna: Floats
-    body_p_dvl: Floats
-    compass_variance_rad2: float
-    """Of the constant bias of the compass."""
-    earth: Floats
-    """Earth's rate in the world, shape (3,), rad/s."""
-    gravity_m_s2: float
-    is_level: bool
-    """True where gravity levels the vehicle."""
-    is_planar: bool
-    plane: Floats
-    """Height of the plane (m), variance of the height and of the tilt, shape (3,)."""
-    walk: Floats
-    """Densities of the biases' walk squared, shape (11,)."""
 
 
 class Samples(NamedTuple):
@@ -113,9 +92,12 @@ def read_detections(range_m: Floats, azimuth_rad: Floats, logged: Floats, R_z: F
     for k in range(len(z)):
         z[k, 0] = range_m[k]
         z[k, 1] = azimuth_rad[k]
-        noise[k] = 0.5 * (logged[k] + logged[k].T)
-        if np.isnan(np.sum(noise[k])):
-            noise[k] = R_z
+        across = 0.5 * (logged[k, 0, 1] + logged[k, 1, 0])
+        is_known = not math.isnan(logged[k, 0, 0] + across + logged[k, 1, 1])
+        noise[k, 0, 0] = logged[k, 0, 0] if is_known else R_z[0, 0]
+        noise[k, 1, 1] = logged[k, 1, 1] if is_known else R_z[1, 1]
+        noise[k, 0, 1] = across if is_known else R_z[0, 1]
+        noise[k, 1, 0] = noise[k, 0, 1]
     return z, noise
 
 
@@ -216,26 +198,6 @@ def remove_rate(motion: Motion, bias: Floats, earth: Floats) -> Motion:
     return Motion(dR @ rotation_exp(theta), dp + dR @ rho, C, D, impulse)
 
 
-@compiled
-def body_measurement(
-    R: Floats, X: Floats, kind: int, arm: Floats, value: Floats, noise: Floats
-) -> tuple[Floats, Floats, Floats]:
-    """Innovation e (m,), H_b (m, 6) and R_z (m, m) of a depth, a heading or a position fix by a body at (R, X).
-
-    H_b is the derivative of what is measured by the perturbation [theta, rho] of the body; ``arm`` the pressure port or
-    the antenna in the body, ``value`` and ``noise`` a row of `Samples`. The compass is taken without bias.
-    """
-    if kind == HEADING:
-        yaw_rad, by_turn = yaw_and_derivative(R)
-        H_b = np.zeros((1, 6))
-        H_b[0, :3] = by_turn
-        return np.array([wrap_angle(value[0] - yaw_rad)]), H_b, noise[:1, :1]
-    first = 2 if kind == DEPTH else 0  # a depth sample is the height alone
-    e = value - (X + R @ arm)
-    return e[first:], body_point_jacobian(R, arm)[first:], noise[first:, first:]
-
-
-@compiled
 def elevation_of_new(R: Floats, X: Floats, sonar: Sonar, z: Floats) -> float:
     """Elevation of a new landmark seen by a body at (R, X): on the floor; 0 without a floor within the aperture."""
     up = sonar.mount.body_R_sonar.T @ R[2]  # in the sonar's axes

@@ -22,7 +22,6 @@ from baselines.events import (
     LONG_AGO,
     NOT_STARTED,
     Call,
-    Model,
     Motion,
     Order,
     Samples,
@@ -34,7 +33,7 @@ from baselines.events import (
     remove_rate,
 )
 from baselines.kalman import NEW, Judged
-from sonar_graph.calibration import Calibration, Section, require_params
+from sonar_graph.calibration import Calibration, PlanarMotion, Section, require_params
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import (
     Depth,
@@ -104,36 +103,20 @@ class FilterParams(Section):
     """Time over which the specific force is averaged for one correction of roll and pitch."""
 
 
-def model_of(calibration: Calibration, params: FilterParams) -> Model:
-    """Numbers that the equations need."""
+def sonar_of(calibration: Calibration, params: FilterParams) -> Sonar:
+    """Sonar, floor, gate and kernel of a filter."""
     sonar = calibration.sonar
     floor = calibration.floor
-    plane = calibration.planar
-    earth = earth_rate_in_world(calibration)
+    body_R_sonar = np.ascontiguousarray(sonar.mounting.pose().rotation().matrix())
     # the chi-square distribution of two degrees of freedom is 1 - exp(-d^2 / 2)
-    gate = math.inf if params.gate_probability == 1 else math.sqrt(-2.0 * math.log(1.0 - params.gate_probability))
-    sonar_model = Sonar(
-        mount=Mount(
-            np.ascontiguousarray(sonar.mounting.pose().rotation().matrix()), np.array(sonar.mounting.translation_m)
-        ),
+    has_gate = params.gate_probability < 1
+    return Sonar(
+        mount=Mount(body_R_sonar, np.array(sonar.mounting.translation_m)),
         aperture_rad=sonar.elevation_aperture_rad,
         floor_z_m=floor.z_m if floor else math.nan,
         floor_variance_m2=floor.sigma_m**2 if floor else math.nan,
-        gate=gate,
+        gate=math.sqrt(-2.0 * math.log(1.0 - params.gate_probability)) if has_gate else math.inf,
         kernel_width=params.kernel_width or math.inf,
-    )
-    return Model(
-        sonar=sonar_model,
-        port=np.array(calibration.depth.port_m),
-        antenna=np.array(calibration.positions.antenna_m),
-        body_p_dvl=np.array(calibration.dvl.mounting.translation_m),
-        compass_variance_rad2=calibration.heading.bias_sigma_rad**2,
-        earth=np.zeros(3) if earth is None else earth,
-        gravity_m_s2=calibration.gravity_m_s2,
-        is_level=calibration.use_gravity,
-        is_planar=plane is not None,
-        plane=np.array([plane.z_m, plane.z_sigma_m**2, plane.tilt_sigma_rad**2]) if plane else np.zeros(3),
-        walk=bias_sigmas(calibration)[1] ** 2,
     )
 
 
@@ -151,13 +134,17 @@ class FilterShell(ABC):
         self.calibration = calibration
         self.odometry = odometry
         self.params = params
-        self.model = model_of(calibration, params)
+        self.sonar = sonar_of(calibration, params)
+        self.port = np.array(calibration.depth.port_m)
+        self.antenna = np.array(calibration.positions.antenna_m)
         self.node_ns = 0
         """Stamp of the newest epoch, that of the state."""
         sonar = calibration.sonar
         self._R_z = np.diag([sonar.range_sigma_m**2, sonar.azimuth_sigma_rad**2])
         self._interval_ns = round(params.gravity_interval_s * 1e9) if calibration.use_gravity else 0
-        self._has_rate = self.has_bias or bool(self.model.earth.any())
+        earth = earth_rate_in_world(calibration)
+        self._earth = np.zeros(3) if earth is None else earth
+        self._has_rate = self.has_bias or earth is not None
         self._reached_ns = NOT_STARTED
         self._done_ns = LONG_AGO
         self._opened_ns = 0
@@ -195,15 +182,23 @@ class FilterShell(ABC):
         """Append a landmark seen for the first time, a motion after the state."""
 
     @abstractmethod
-    def update_body(self, motion: Motion, kind: int, value: Floats, noise: Floats) -> float:
-        """Update by a row of `Samples`, a motion after the state, and return its distance in sigmas."""
+    def update_depth(self, motion: Motion, z_m: float, variance_m2: float) -> None:
+        """Update by the height of the pressure port, a motion after the state."""
+
+    @abstractmethod
+    def update_heading(self, motion: Motion, yaw_rad: float, variance_rad2: float) -> float:
+        """Update by the yaw of the body and the compass' bias, a motion after the state; its distance in sigmas."""
+
+    @abstractmethod
+    def update_position(self, motion: Motion, position_m: Floats, cov_m2: Floats) -> float:
+        """Update by the position of the antenna, a motion after the state; its distance in sigmas."""
 
     @abstractmethod
     def update_up(self, up: Floats, sigma_rad: float, i_R_j: Floats) -> None:
         """Update by the direction of the world's up in the body, measured over an interval from i to j."""
 
     @abstractmethod
-    def update_plane(self) -> None:
+    def update_plane(self, plane: PlanarMotion) -> None:
         """Update by the plane on which the vehicle stays."""
 
     @abstractmethod
@@ -284,7 +279,7 @@ class FilterShell(ABC):
     def withheld(self) -> list[str]:
         """Messages about headings, fixes and detections that the state contradicts."""
         messages = self._contradictions.messages()
-        if math.isfinite(self.model.sonar.gate) or math.isfinite(self.model.sonar.kernel_width):
+        if math.isfinite(self.sonar.gate) or math.isfinite(self.sonar.kernel_width):
             messages += lockout_messages(self.detections())
         return messages
 
@@ -405,10 +400,14 @@ class FilterShell(ABC):
                 self._to_epoch(motion, int(order.end_ns[k]), ends_interval=order.ends_interval[k])
             elif kind == FRAME:
                 self._see(motion, views, row)
-            elif kind != END:
-                distance = self.update_body(motion, kind, samples.value[row], samples.noise[row])
-                if kind != DEPTH:
-                    self._contradictions.judge(SENSORS[kind], distance)
+            elif kind == DEPTH:
+                self.update_depth(motion, samples.value[row, 2], samples.noise[row, 2, 2])
+            elif kind == HEADING:
+                distance = self.update_heading(motion, samples.value[row, 0], samples.noise[row, 0, 0])
+                self._contradictions.judge("heading", distance)
+            elif kind == FIX:
+                distance = self.update_position(motion, samples.value[row], samples.noise[row])
+                self._contradictions.judge("positions", distance)
             self.check(self.node_ns)
         R, X, covariance = self.pose_after(motion)
         self.odometry.settle(self.node_ns)
@@ -421,7 +420,7 @@ class FilterShell(ABC):
         """The motion without the gyro bias of the state and the Earth's rate."""
         if not self._has_rate:
             return motion
-        return remove_rate(motion, self.gyro_bias(), self.attitude().T @ self.model.earth)
+        return remove_rate(motion, self.gyro_bias(), self.attitude().T @ self._earth)
 
     def _to_epoch(self, motion: Motion, epoch_ns: int, *, ends_interval: bool) -> None:
         """Predict to an epoch, and correct there by the plane, and by gravity where an interval of it ends."""
@@ -430,7 +429,7 @@ class FilterShell(ABC):
         self._impulse = self._impulse + self._turned @ motion.impulse
         self._turned = self._turned @ motion.dR
         if self.calibration.planar is not None:
-            self.update_plane()
+            self.update_plane(self.calibration.planar)
         if ends_interval:
             self._level(epoch_ns)
 
@@ -509,17 +508,16 @@ class FilterShell(ABC):
             attitude = attitude @ motion.dR.T
             between = self.odometry.motion(first_ns, last_ns, self.gyro_bias(), attitude, since_ns)
             motion = backwards(between)
-        distance = self.update_body(motion, FIX, position_m, noise)
-        self._contradictions.judge(SENSORS[FIX], distance)
+        self._contradictions.judge("positions", self.update_position(motion, position_m, noise))
 
 
 def motion_of(over: PreintegratedMotion) -> Motion:
     """The motion as arrays."""
     return Motion(
         dR=np.ascontiguousarray(over.i_T_j.rotation().matrix()),
-        dp=over.i_T_j.translation(),
-        C=over.covariance,
-        D=over.D_bias,
+        dp=np.array(over.i_T_j.translation()),
+        C=np.ascontiguousarray(over.covariance),
+        D=np.ascontiguousarray(over.D_bias),
         impulse=over.mean_specific_force * over.duration_s,
     )
 
@@ -530,9 +528,9 @@ def backwards(over: PreintegratedMotion) -> Motion:
     back = over.i_T_j.inverse()
     return Motion(
         dR=np.ascontiguousarray(back.rotation().matrix()),
-        dp=back.translation(),
-        C=A @ over.covariance @ A.T,
-        D=-A @ over.D_bias,
+        dp=np.array(back.translation()),
+        C=np.ascontiguousarray(A @ over.covariance @ A.T),
+        D=np.ascontiguousarray(-A @ over.D_bias),
         impulse=np.full(3, math.nan),
     )
 

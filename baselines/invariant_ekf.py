@@ -42,13 +42,12 @@ Every H but those of compass and position fixes is zero along a shift of everyth
 vertical, at any estimate, so these unobservable directions stay unobservable. Derivation: docs/theory/invariant_ekf.md.
 """
 
-import math
 from typing import ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
-from baselines.events import DEPTH, HEADING, Model, Motion, body_measurement, elevation_of_new
+from baselines.events import Motion, Sonar, elevation_of_new
 from baselines.filter import FilterParams, FilterShell
 from baselines.kalman import (
     GATED,
@@ -63,7 +62,7 @@ from baselines.kalman import (
     polar_covariance,
     symmetric,
 )
-from sonar_graph.calibration import Calibration, Section
+from sonar_graph.calibration import Calibration, PlanarMotion, Section
 from sonar_graph.measurements import Floats
 from sonar_graph.models import (
     ACCEL,
@@ -73,11 +72,13 @@ from sonar_graph.models import (
     SCALE,
     bias_jacobian,
     bias_sigmas,
+    body_point_jacobian,
     gyro_bias_of,
     huber_scale,
     locate_from_body,
     view_from_body,
     wrap_angle,
+    yaw_and_derivative,
 )
 from sonar_graph.motion import MotionSource
 from sonar_graph.numerics import compiled, cross_matrix, left_jacobian, rotation_exp
@@ -88,6 +89,7 @@ BARE, POINT = 6 + BIASES, 3
 """Length of xi without landmarks, and of one xi_k."""
 BETA_ACCEL = slice(3 + ACCEL.start, 3 + ACCEL.stop)
 BETA_COMPASS = 3 + COMPASS
+NO_UP = np.zeros(3)
 
 
 class InvariantState(NamedTuple):
@@ -101,6 +103,10 @@ class InvariantState(NamedTuple):
     """b of `sonar_graph.models.biases`, shape (11,)."""
     P: Floats
     """Covariance of xi, shape (17 + 3 N, 17 + 3 N)."""
+    body_p_dvl: Floats
+    """Doppler log in the body, shape (3,), m."""
+    is_level: bool
+    """True where gravity levels the vehicle."""
 
 
 def place_of(k: int) -> slice:
@@ -112,24 +118,27 @@ def place_of(k: int) -> slice:
 
 
 @compiled
-def up_in_body(state: InvariantState, model: Model) -> Floats:
+def up_in_body(state: InvariantState) -> Floats:
     """The world's up in the body as it splits the gyros' bias, shape (3,); zero without gravity."""
-    return state.R[2].copy() if model.is_level else np.zeros(3)
+    return state.R[2].copy() if state.is_level else np.zeros(3)
 
 
 @compiled
-def pose_after(state: InvariantState, motion: Motion, model: Model) -> tuple[Floats, Floats, Floats]:
+def pose_after(state: InvariantState, motion: Motion) -> tuple[Floats, Floats, Floats]:
     """R' (3, 3) and X' (3,) of (2), without the scale error of the Doppler log, and D (6, 11)."""
-    D = bias_jacobian(motion.D, motion.dR, motion.dp, up_in_body(state, model), state.R[2], model.body_p_dvl)
+    D = bias_jacobian(motion.D, motion.dR, motion.dp, up_in_body(state), state.R[2], state.body_p_dvl)
     R = state.R @ motion.dR
     X = state.points[0] + state.R @ motion.dp + R @ (D[3:, SCALE] * state.bias[SCALE])
     return R, X, D
 
 
 @compiled
-def predict(state: InvariantState, motion: Motion, model: Model, duration_s: float) -> None:
-    """Carry estimate and covariance over a motion, (2) and (3): ``P <- F P F^T + J C J^T``, ``F = I + J D E_beta``."""
-    R, X, D = pose_after(state, motion, model)
+def predict(state: InvariantState, motion: Motion, walk_variance: Floats) -> None:
+    """Carry estimate and covariance over a motion, (2) and (3): ``P <- F P F^T + J C J^T``, ``F = I + J D E_beta``.
+
+    ``walk_variance``: of the biases since, shape (11,).
+    """
+    R, X, D = pose_after(state, motion)
     state.R[:] = R
     state.points[0] = X
     P = state.P
@@ -143,7 +152,7 @@ def predict(state: InvariantState, motion: Motion, model: Model, duration_s: flo
     M = JD @ (P[BETA] + 0.5 * P[BETA, BETA].copy() @ JD.T) + J @ (0.5 * motion.C @ J.T)
     P += M + M.T
     for i in range(BIASES):
-        P[BETA.start + i, BETA.start + i] += model.walk[i] * duration_s
+        P[BETA.start + i, BETA.start + i] += walk_variance[i]
 
 
 # -------------------------------------------------------------------------------- update
@@ -161,12 +170,11 @@ def update(state: InvariantState, H: Floats, e: Floats, R: Floats) -> None:
 
 @compiled
 def observe(
-    state: InvariantState, k: int, motion: Motion, model: Model, z: Floats, R_z: Floats
+    state: InvariantState, k: int, motion: Motion, sonar: Sonar, z: Floats, R_z: Floats
 ) -> tuple[int, Floats, Floats]:
     """Update by range and azimuth of a known landmark, (5); outcome, innovation and its covariance."""
     at = BODY.start + POINT * k
-    sonar = model.sonar
-    R, X, D = pose_after(state, motion, model)
+    R, X, D = pose_after(state, motion)
     z_hat, H_b, H_p = view_from_body(R, X, sonar.mount, state.points[k])
     e = z - z_hat
     e[1] = wrap_angle(e[1])
@@ -183,15 +191,14 @@ def observe(
 
 
 def observe_far(
-    state: InvariantState, k: int, motion: Motion, model: Model, z: Floats, R_z: Floats
+    state: InvariantState, k: int, motion: Motion, sonar: Sonar, z: Floats, R_z: Floats
 ) -> Judged | None:
     """Update as `observe` by a landmark far from where it is predicted, by the point seen, (6); None if it is near.
 
     Exp(theta) turns both points: the innovation is ``xi_k - xi_new``, without theta however far they are apart.
     """
     at = BODY.start + POINT * k
-    sonar = model.sonar
-    R, X, D = pose_after(state, motion, model)
+    R, X, D = pose_after(state, motion)
     g, G_b, G_z = locate_from_body(R, X, sonar.mount, z, 0.0)
     e = g - state.points[k]
     H = np.zeros((POINT, len(state.P)))
@@ -210,38 +217,63 @@ def observe_far(
 
 
 @compiled
-def update_body(
-    state: InvariantState, motion: Motion, model: Model, kind: int, value: Floats, noise: Floats
-) -> float:
-    """Update by a depth or a position fix, (7), or a heading, (10), the latter two with Huber's kernel.
-
-    Returns the distance from the estimate in sigmas, where the bias of the compass counts as noise.
-    """
-    R, X, D = pose_after(state, motion, model)
-    arm = model.port if kind == DEPTH else model.antenna
-    e, H_b, R_z = body_measurement(R, X, kind, arm, value, noise)
-    H = np.zeros((len(e), len(state.P)))
-    if kind == HEADING:
-        H[:, THETA] = H_b[:, :3].copy() @ R.T
-    else:
-        H[:, THETA] = -cross_matrix(X + R @ arm)[-len(e) :]  # of a depth the last row
-        H[:, BODY] = np.eye(3)[-len(e) :]
+def position_jacobian(state: InvariantState, a: Floats, H_b: Floats, D: Floats) -> Floats:
+    """H of the position a of a point of the body, (7), shape (3, 17 + 3 N)."""
+    H = np.zeros((3, len(state.P)))
+    H[:, THETA] = -cross_matrix(a)
+    H[:, BODY] = np.eye(3)
     H[:, BETA] = H_b @ D  # (4)
-    R_b = H_b @ motion.C @ H_b.T + R_z
-    S = H @ state.P @ H.T + R_b  # (9)
-    if kind == HEADING:
-        off = distance(e, S + model.compass_variance_rad2)
-        e[0] = wrap_angle(e[0] - state.bias[COMPASS])
-        H[0, BETA_COMPASS] = 1.0
-        S = H @ state.P @ H.T + R_b
-    else:
-        off = distance(e, S)
-    scale = 1.0 if kind == DEPTH else huber_scale(e, S)
-    update(state, H, e, R_b + (scale - 1.0) * R_z)
-    return off
+    return H
 
 
 @compiled
+def update_depth(state: InvariantState, motion: Motion, port: Floats, z_m: float, variance_m2: float) -> None:
+    """Update by the height of the pressure port, (7)."""
+    R, X, D = pose_after(state, motion)
+    a = X + R @ port
+    H_b = body_point_jacobian(R, port)
+    H = position_jacobian(state, a, H_b, D)[2:]
+    H_b = H_b[2:]  # (1, 6)
+    update(state, H, z_m - a[2:], H_b @ motion.C @ H_b.T + variance_m2)
+
+
+def update_heading(
+    state: InvariantState, motion: Motion, yaw_rad: float, variance_rad2: float, bias_variance_rad2: float
+) -> float:
+    """Update by a compass, (10), with Huber's kernel.
+
+    Returns the distance from the yaw in sigmas, in which the bias of the compass is noise of the calibration's variance.
+    """
+    R, _, D = pose_after(state, motion)
+    yaw, by_turn = yaw_and_derivative(R)
+    H_b = np.zeros((1, 6))
+    H_b[0, :3] = by_turn
+    H = np.zeros((1, len(state.P)))
+    H[0, THETA] = R @ by_turn
+    H[:, BETA] = H_b @ D  # (4)
+    noise = H_b @ motion.C @ H_b.T
+    S = H @ state.P @ H.T + noise + variance_rad2 + bias_variance_rad2
+    off = distance(np.array([wrap_angle(yaw_rad - yaw)]), S)
+    H[0, BETA_COMPASS] = 1.0
+    e = np.array([wrap_angle(yaw_rad - yaw - state.bias[COMPASS])])
+    scale = huber_scale(e, H @ state.P @ H.T + noise + variance_rad2)
+    update(state, H, e, noise + scale * variance_rad2)
+    return off
+
+
+def update_position(state: InvariantState, motion: Motion, q: Floats, position_m: Floats, R_z: Floats) -> float:
+    """Update by the position of a point q of the body, (7), with Huber's kernel; the distance in sigmas."""
+    R, X, D = pose_after(state, motion)
+    a = X + R @ q
+    H_b = body_point_jacobian(R, q)
+    H = position_jacobian(state, a, H_b, D)
+    e = position_m - a
+    noise = H_b @ motion.C @ H_b.T
+    S = symmetric(H @ state.P @ H.T + noise + R_z)  # (9)
+    update(state, H, e, noise + huber_scale(e, S) * R_z)
+    return distance(e, S)
+
+
 def update_up(state: InvariantState, up: Floats, by_accel: Floats, sigma_rad: float) -> None:
     """Update by the direction of the world's up in the body, (8); ``by_accel``: A, shape (3, 3)."""
     by_bias = state.R @ by_accel
@@ -253,7 +285,6 @@ def update_up(state: InvariantState, up: Floats, by_accel: Floats, sigma_rad: fl
     update(state, H, y[:2], sigma_rad**2 * np.eye(2))
 
 
-@compiled
 def height_jacobian(state: InvariantState, k: int) -> Floats:
     """H of the height of x_k, (7), shape (1, 17 + 3 N)."""
     H = np.zeros((1, len(state.P)))
@@ -263,19 +294,19 @@ def height_jacobian(state: InvariantState, k: int) -> Floats:
     return H
 
 
-def update_plane(state: InvariantState, plane: Floats) -> None:
+def update_plane(state: InvariantState, plane: PlanarMotion) -> None:
     """Update by the plane on which the vehicle stays: height of the body, (7), and tilt, (8)."""
-    update(state, height_jacobian(state, 0), plane[0] - state.points[0, 2:], plane[1] * np.eye(1))
-    update_up(state, np.array([0.0, 0.0, 1.0]), np.zeros((3, 3)), math.sqrt(plane[2]))
+    e = plane.z_m - state.points[0, 2:]
+    update(state, height_jacobian(state, 0), e, np.array([[plane.z_sigma_m**2]]))
+    update_up(state, np.array([0.0, 0.0, 1.0]), np.zeros((3, 3)), plane.tilt_sigma_rad)
 
 
 # -------------------------------------------------------------------------------- augmentation
 
 
-def augment(state: InvariantState, motion: Motion, model: Model, z: Floats, R_z: Floats) -> InvariantState:
+def augment(state: InvariantState, motion: Motion, sonar: Sonar, z: Floats, R_z: Floats) -> InvariantState:
     """State with a new landmark, (6), on a floor of known height if it is near."""
-    sonar = model.sonar
-    R, X, D = pose_after(state, motion, model)
+    R, X, D = pose_after(state, motion)
     g, G_b, G_z = locate_from_body(R, X, sonar.mount, z, elevation_of_new(R, X, sonar, z))
     G = np.zeros((POINT, len(state.P)))
     G[:, BODY] = np.eye(3)
@@ -283,7 +314,7 @@ def augment(state: InvariantState, motion: Motion, model: Model, z: Floats, R_z:
     GP = G @ state.P
     V = G_z @ polar_covariance(R_z, sonar.aperture_rad) @ G_z.T
     P = bordered(state.P, GP, symmetric(GP @ G.T + G_b @ motion.C @ G_b.T + V))
-    state = InvariantState(state.R, np.concatenate((state.points, g.reshape(1, 3))), state.bias, P)
+    state = state._replace(points=np.concatenate((state.points, g.reshape(1, 3))), P=P)
     k = len(state.points) - 1
     H = height_jacobian(state, k)
     e = sonar.floor_z_m - state.points[k, 2:]  # NaN where the floor is not known
@@ -333,31 +364,46 @@ class InvariantEkf(FilterShell):
         self, calibration: Calibration, odometry: MotionSource, params: InvariantEkfParams | None = None
     ) -> None:
         super().__init__(calibration, odometry, params or InvariantEkfParams())
+        self._walk_density = bias_sigmas(calibration)[1]
         self._state = start_state(calibration)
 
     def state(self) -> tuple[int, InvariantState]:
         """Stamp (ns) and a copy of the state at the newest epoch."""
-        return self.node_ns, InvariantState(*(part.copy() for part in self._state))
+        return self.node_ns, self._state._replace(
+            R=self._state.R.copy(),
+            points=self._state.points.copy(),
+            bias=self._state.bias.copy(),
+            P=self._state.P.copy(),
+        )
 
     def predict(self, motion: Motion, duration_s: float) -> None:
         """Carry the state over the motion to the next epoch, (2) and (3)."""
-        predict(self._state, motion, self.model, duration_s)
+        predict(self._state, motion, self._walk_density**2 * duration_s)
 
     def observe(self, motion: Motion, slot: int, z: Floats, R_z: Floats) -> Judged:
         """Update by range and azimuth of a known landmark, (5)."""
-        return Judged(*observe(self._state, 1 + slot, motion, self.model, z, R_z))
+        return Judged(*observe(self._state, 1 + slot, motion, self.sonar, z, R_z))
 
     def observe_far(self, motion: Motion, slot: int, z: Floats, R_z: Floats) -> Judged | None:
         """Update by a landmark that may be far from where it is predicted, (6)."""
-        return observe_far(self._state, 1 + slot, motion, self.model, z, R_z)
+        return observe_far(self._state, 1 + slot, motion, self.sonar, z, R_z)
 
     def augment(self, motion: Motion, z: Floats, R_z: Floats) -> None:
         """Append a landmark, (6)."""
-        self._state = augment(self._state, motion, self.model, z, R_z)
+        self._state = augment(self._state, motion, self.sonar, z, R_z)
 
-    def update_body(self, motion: Motion, kind: int, value: Floats, noise: Floats) -> float:
-        """Update by a depth, a heading or a position fix, (7) and (10)."""
-        return update_body(self._state, motion, self.model, kind, value, noise)
+    def update_depth(self, motion: Motion, z_m: float, variance_m2: float) -> None:
+        """Update by the height of the pressure port, (7)."""
+        update_depth(self._state, motion, self.port, z_m, variance_m2)
+
+    def update_heading(self, motion: Motion, yaw_rad: float, variance_rad2: float) -> float:
+        """Update by the yaw of the body and the compass' bias, (10)."""
+        bias_variance_rad2 = self.calibration.heading.bias_sigma_rad**2
+        return update_heading(self._state, motion, yaw_rad, variance_rad2, bias_variance_rad2)
+
+    def update_position(self, motion: Motion, position_m: Floats, cov_m2: Floats) -> float:
+        """Update by the position of the antenna, (7)."""
+        return update_position(self._state, motion, self.antenna, position_m, cov_m2)
 
     def update_up(self, up: Floats, sigma_rad: float, i_R_j: Floats) -> None:
         """Update by the direction of the world's up, (8)."""
@@ -365,9 +411,9 @@ class InvariantEkf(FilterShell):
         by_accel = 0.5 * (np.eye(3) + i_R_j.T) / self.calibration.gravity_m_s2
         update_up(self._state, up, by_accel, sigma_rad)
 
-    def update_plane(self) -> None:
+    def update_plane(self, plane: PlanarMotion) -> None:
         """Update by the plane on which the vehicle stays, (7) and (8)."""
-        update_plane(self._state, self.model.plane)
+        update_plane(self._state, plane)
 
     def attitude(self) -> Floats:
         """world_R_body of the state, shape (3, 3)."""
@@ -375,14 +421,14 @@ class InvariantEkf(FilterShell):
 
     def gyro_bias(self) -> Floats:
         """Estimated gyro bias, shape (3,), rad/s."""
-        return gyro_bias_of(self._state.bias, up_in_body(self._state, self.model))
+        return gyro_bias_of(self._state.bias, self._state.R[2] if self._state.is_level else NO_UP)
 
     def pose_after(self, motion: Motion) -> tuple[Floats, Floats, Floats]:
         """world_R_body (3, 3), position (3,), and covariance of [theta, rho] (6, 6) a motion after the state.
 
         The error of the state is there ``[R'^T theta; R'^T (xi_0 - [X']x theta)]``, to which ``D beta + eps`` is added.
         """
-        R, X, D = pose_after(self._state, motion, self.model)
+        R, X, D = pose_after(self._state, motion)
         A = np.zeros((6, BARE))
         A[:3, THETA] = R.T
         A[3:, BODY] = R.T
@@ -413,4 +459,5 @@ def start_state(calibration: Calibration) -> InvariantState:
     A[BODY, 3:] = np.eye(3)
     P = A @ np.diag(np.square((*start.rpy_sigma_rad, *start.position_sigma_m))) @ A.T
     P[BETA, BETA] = np.diag(bias_sigmas(calibration)[0] ** 2)
-    return InvariantState(R, X[None].copy(), np.zeros(BIASES), symmetric(P))
+    body_p_dvl = np.array(calibration.dvl.mounting.translation_m)
+    return InvariantState(R, X[None].copy(), np.zeros(BIASES), symmetric(P), body_p_dvl, calibration.use_gravity)

@@ -65,7 +65,7 @@ def bordered(P: Floats, P_pv: Floats, P_pp: Floats) -> Floats:
 @compiled
 def distance(e: Floats, S: Floats) -> float:
     """``sqrt(e^T S^-1 e)``, the Mahalanobis distance of an innovation."""
-    return math.sqrt(e @ np.linalg.solve(S, e))
+    return math.sqrt(e @ np.linalg.inv(S) @ e)
 
 
 @compiled
@@ -77,8 +77,14 @@ def judged(e: Floats, S: Floats, R_z: Floats, gate: float, kernel_width: float) 
     """
     if not distance(e, S) <= gate:
         return GATED, np.zeros((2, 2))
-    spread = np.sqrt(1.0 + e * e / (np.diag(S) * kernel_width**2))  # 1 / sqrt(w)
-    return USED, (np.outer(spread, spread) - 1.0) * R_z
+    spread = np.empty(2)  # 1 / sqrt(w)
+    for i in range(2):
+        spread[i] = math.sqrt(1.0 + e[i] ** 2 / (S[i, i] * kernel_width**2))
+    widened = np.empty((2, 2))
+    for i in range(2):
+        for j in range(2):
+            widened[i, j] = (spread[i] * spread[j] - 1.0) * R_z[i, j]
+    return USED, widened
 
 
 def is_far(cov: Floats, G_z: Floats, range_m: float, R_z: Floats) -> bool:

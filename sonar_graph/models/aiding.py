@@ -13,7 +13,6 @@ from collections import Counter
 import numpy as np
 
 from sonar_graph.measurements import Floats
-from sonar_graph.numerics import compiled
 
 HEADING_WIDTH, FIX_WIDTH = 1.345, 1.628
 HUBER_WIDTHS = {1: HEADING_WIDTH, 3: FIX_WIDTH}
@@ -21,7 +20,6 @@ HUBER_WIDTHS = {1: HEADING_WIDTH, 3: FIX_WIDTH}
 that is far off finds its way, which a kernel that lets go of large errors does not promise."""
 
 
-@compiled
 def yaw_and_derivative(R: Floats) -> tuple[float, Floats]:
     """Yaw of a rotation, rad, and its derivative by a turn of the body, shape (3,)."""
     x, a, c = R[0, 0], R[0, 1], R[0, 2]
@@ -30,11 +28,10 @@ def yaw_and_derivative(R: Floats) -> tuple[float, Floats]:
     return math.atan2(y, x), np.array([0.0, (y * c - x * d) / level2, (x * b - y * a) / level2])
 
 
-@compiled
 def huber_scale(e: Floats, S: Floats) -> float:
     """Factor ``max(1, d / k)`` by which Huber's kernel widens the noise of an innovation e of covariance S."""
     k = HEADING_WIDTH if len(e) == 1 else FIX_WIDTH
-    return max(1.0, math.sqrt(e @ np.linalg.solve(S, e)) / k)
+    return max(1.0, math.sqrt(e @ np.linalg.inv(S) @ e) / k)
 
 
 CONTRADICTING_SIGMAS = 5.0

@@ -150,8 +150,11 @@ def view_from_body(R: Floats, X: Floats, mount: Mount, p: Floats) -> tuple[Float
     """
     q = R.T @ (p - X)  # in body axes
     z, D_q = project(mount.body_R_sonar.T @ (q - mount.body_p_sonar))
-    N = D_q @ mount.body_R_sonar.T  # derivative by q
-    return z, -N @ body_point_jacobian(np.eye(3), q), N @ R.T
+    N = D_q @ mount.body_R_sonar.T  # derivative by q, which moves by -[-[q]x  I] [theta; rho]
+    by_body = np.empty((2, 6))
+    by_body[:, :3] = N @ cross_matrix(q)
+    by_body[:, 3:] = -N
+    return z, by_body, N @ R.T
 
 
 @compiled
