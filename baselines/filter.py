@@ -1,42 +1,38 @@
-"""Shell of both landmark filters: the contract, the way through the events of a call, and outcomes of detections.
+"""Shell of both landmark filters: the contract of an estimator, events of a call, gaps, outcomes of detections.
 
-A subclass adds the mathematics. Order and meaning of the events: `baselines.event_order`; gate, kernel and landmarks
-that are far from where they are predicted: `baselines.sonar_update`. Choices that the paper leaves open:
-docs/theory/ekf_slam.md.
+A subclass adds the equations. Choices that the paper leaves open: docs/theory/ekf_slam.md.
 """
 
 import math
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
-from baselines.event_order import (
+from baselines.events import (
     DEPTH,
     END,
+    EPOCH,
     FIX,
     FRAME,
-    GRAVITY,
     HEADING,
     LONG_AGO,
-    NO_BIAS,
-    NO_DEPTH,
-    NO_GRAVITY,
-    NO_SAMPLES,
-    NO_STAMPS,
-    NO_VIEWS,
     NOT_STARTED,
-    PLANE,
-    Events,
+    Call,
     Motion,
+    Order,
+    Samples,
+    Sonar,
     Views,
-    accepted_rows,
+    in_frame,
     in_order,
+    read_detections,
     remove_rate,
 )
-from baselines.sonar_update import JUDGED_TOGETHER, NEW, Gate, SonarModel, read
+from baselines.kalman import NEW, Judged
 from sonar_graph.calibration import Calibration, PlanarMotion, Section, require_params
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import (
@@ -49,10 +45,15 @@ from sonar_graph.measurements import (
     PositionFixes,
     require_measurements,
 )
-from sonar_graph.models import MINIMUM_PROBABILITY, Contradictions, identify, wrap_angle, yaw_and_derivative
-from sonar_graph.motion import MotionSource, require_source
-from sonar_graph.navigation.alignment import earth_rate_in_world, tilt_sigma
-from sonar_graph.numerics import cross_matrix
+from sonar_graph.models import (
+    ACCEPTED,
+    MINIMUM_PROBABILITY,
+    Contradictions,
+    Mount,
+    identify,
+)
+from sonar_graph.motion import MotionSource, PreintegratedMotion, require_source
+from sonar_graph.navigation.alignment import earth_rate_in_world, tilt_sigma, up_direction
 from sonar_graph.states import (
     OUTCOME_NUMBERS,
     CausalEstimates,
@@ -70,83 +71,134 @@ KEPT_NS = 20_000_000_000
 """Age of a position fix up to which rows for it are kept: the smoother's window by default. Up to twice as many are
 kept, since dropping them costs as much as keeping a few."""
 
+NO_STAMPS = np.empty(0, np.int64)
+NO_SAMPLES = Samples(NO_STAMPS, NO_STAMPS, np.empty((0, 3)), np.empty((0, 3, 3)))
+NO_VIEWS = Views(
+    stamp_ns=NO_STAMPS,
+    slot=NO_STAMPS,
+    z=np.empty((0, 2)),
+    R_z=np.empty((0, 2, 2)),
+    outcome=np.empty(0, np.int8),
+    e=np.empty((0, 2)),
+    S=np.empty((0, 2, 2)),
+)
+NO_BIAS = np.zeros(3)
+
 
 class FilterParams(Section):
-    """Settings of both filters; the paper gives none of them, and neither gate nor kernel."""
+    """Settings of both filters; the paper has none of them."""
 
     gate_probability: float = Field(1.0, gt=0, le=1)
     """Probability with which a right detection passes the gate (chi-square); 1: no gate, as published."""
     kernel_width: float = Field(0.0, ge=0)
     """Width in standard deviations of a Cauchy kernel by which outlying ranges and azimuths pull less, that of
     `sonar_graph.slam.RobustKernel`; 0: no kernel, as published."""
+    far_views: bool = False
+    """After a gap of the Doppler log, compare a landmark far from where it is predicted with the point seen, where (6)
+    and (7) are not linear enough; False: (6) and (7) everywhere, as published."""
     minimum_id_probability: float = Field(MINIMUM_PROBABILITY, ge=0, le=1)
     """Least posterior of the most probable identity with which a detection is used; the smoother's default too."""
     gravity_interval_s: float = Field(1.0, gt=0)
     """Time over which the specific force is averaged for one correction of roll and pitch."""
 
 
+def sonar_of(calibration: Calibration, params: FilterParams) -> Sonar:
+    """Sonar, floor, gate and kernel of a filter."""
+    sonar = calibration.sonar
+    floor = calibration.floor
+    body_R_sonar = np.ascontiguousarray(sonar.mounting.pose().rotation().matrix())
+    # the chi-square distribution of two degrees of freedom is 1 - exp(-d^2 / 2)
+    has_gate = params.gate_probability < 1
+    return Sonar(
+        mount=Mount(body_R_sonar, np.array(sonar.mounting.translation_m)),
+        aperture_rad=sonar.elevation_aperture_rad,
+        floor_z_m=floor.z_m if floor else math.nan,
+        floor_variance_m2=floor.sigma_m**2 if floor else math.nan,
+        gate=math.sqrt(-2.0 * math.log(1.0 - params.gate_probability)) if has_gate else math.inf,
+        kernel_width=params.kernel_width or math.inf,
+    )
+
+
 class FilterShell(ABC):
-    """Estimator around the mathematics of a filter, which a subclass adds; `name` stands in messages."""
+    """Estimator around the equations of a filter, which a subclass adds; `name` stands in messages."""
 
     name: str
     Params: ClassVar[type[Section]]
+    has_bias = False
+    """True where the state has a gyro bias."""
 
     def __init__(self, calibration: Calibration, odometry: MotionSource, params: FilterParams) -> None:
         require_source(odometry, calibration, f"{type(self).__name__}(calibration, odometry, params)")
         require_params(params, self.Params, self.name)
-        self.calibration, self.odometry = calibration, odometry
-        self.sonar = SonarModel.of(calibration, Gate.of(params.gate_probability, params.kernel_width))
+        self.calibration = calibration
+        self.odometry = odometry
+        self.params = params
+        self.sonar = sonar_of(calibration, params)
         self.port = np.array(calibration.depth.port_m)
-        self._minimum_id_probability, earth = params.minimum_id_probability, earth_rate_in_world(calibration)
-        self.earth, self._has_rate = np.zeros(3) if earth is None else earth, self.has_bias or earth is not None
-        self._plane, self.depth_variance = calibration.planar, calibration.depth.sigma_m**2
-        self._interval_ns = round(params.gravity_interval_s * 1e9) if calibration.use_gravity else 0
+        self.antenna = np.array(calibration.positions.antenna_m)
         self.node_ns = 0
         """Stamp of the newest epoch, that of the state."""
-        self._reached_ns, self._done_ns = NOT_STARTED, LONG_AGO
-        self._opened_ns, self._opened_velocity, self._kept_ns = 0, (np.zeros(3), 0.0), 0
-        self.turned, self.impulse = np.eye(3), np.zeros(3)
-        self._in_gap: dict[tuple[int, int], int] = {}
-        self._was_lost = False
+        sonar = calibration.sonar
+        self._R_z = np.diag([sonar.range_sigma_m**2, sonar.azimuth_sigma_rad**2])
+        self._interval_ns = round(params.gravity_interval_s * 1e9) if calibration.use_gravity else 0
+        earth = earth_rate_in_world(calibration)
+        self._earth = np.zeros(3) if earth is None else earth
+        self._has_rate = self.has_bias or earth is not None
+        self._reached_ns = NOT_STARTED
+        self._done_ns = LONG_AGO
+        self._opened_ns = 0
+        self._opened_velocity = (np.zeros(3), 0.0)
+        self._turned = np.eye(3)
+        """Rotation since the interval of gravity began."""
+        self._impulse = np.zeros(3)
+        """Specific force since then, integrated in the frame of its start."""
+        self._kept_ns = 0
+        self._used_in_gap: dict[tuple[int, int], int] = {}
+        self._may_be_far = False
+        self._landmarks = 0
         self._slots: dict[int, int] = {}
-        self._journal, self._estimates = DetectionJournal(), CausalEstimates()
+        self._journal = DetectionJournal()
+        self._estimates = CausalEstimates()
         self._refused: list[RefusedRow] = []
         self._contradictions = Contradictions()
 
-    # ---------------------------------------------------------------- mathematics of a filter
+    # ---------------------------------------------------------------- equations of a filter
 
     @abstractmethod
-    def advance(self, events: Events, k: int) -> int:
-        """Predict over epochs and continue the interval of gravity (`add_force`), correct by gravity and depth.
-
-        From event k to one over a gap or of another kind, whose number is returned; frames may be used, `Views` filled.
-        """
+    def predict(self, motion: Motion, duration_s: float) -> None:
+        """Carry the state over the motion to the next epoch."""
 
     @abstractmethod
-    def correct_plane(self, plane: PlanarMotion) -> None:
-        """Update by the plane on which the vehicle stays."""
+    def observe(self, motion: Motion, slot: int, z: Floats, R_z: Floats) -> Judged:
+        """Update by range and azimuth of a known landmark, a motion after the state."""
 
     @abstractmethod
-    def correct_heading(self, motion: Motion, yaw_rad: float, variance_rad2: float) -> None:
-        """Update by the yaw of the body and the compass' bias, a motion after the state; robust (`doubted`)."""
-
-    @abstractmethod
-    def correct_position(self, motion: Motion, point: Floats, position_m: Floats, cov_m2: Floats) -> None:
-        """Update by the world position of a point of the body (3,), a motion after the state; robust (`doubted`)."""
-
-    @abstractmethod
-    def observe(
-        self, motion: Motion, slot: int, z: Floats, R_z: Floats, *, may_be_far: bool
-    ) -> tuple[int, Floats, Floats]:
-        """Update by range and azimuth of a known landmark, a motion after the state, where `admit` does.
-
-        Returns the outcome's number, the innovation (2,) and its covariance (2, 2). ``may_be_far``: the Doppler log has
-        lost the bottom, and landmarks may be far from where they are predicted (`far_view`).
-        """
+    def observe_far(self, motion: Motion, slot: int, z: Floats, R_z: Floats) -> Judged | None:
+        """Update as `observe` by the point seen, where (6) and (7) are not linear enough; None where they are."""
 
     @abstractmethod
     def augment(self, motion: Motion, z: Floats, R_z: Floats) -> None:
         """Append a landmark seen for the first time, a motion after the state."""
+
+    @abstractmethod
+    def update_depth(self, motion: Motion, z_m: float, variance_m2: float) -> None:
+        """Update by the height of the pressure port, a motion after the state."""
+
+    @abstractmethod
+    def update_heading(self, motion: Motion, yaw_rad: float, variance_rad2: float) -> float:
+        """Update by the yaw of the body and the compass' bias, a motion after the state; its distance in sigmas."""
+
+    @abstractmethod
+    def update_position(self, motion: Motion, position_m: Floats, cov_m2: Floats) -> float:
+        """Update by the position of the antenna, a motion after the state; its distance in sigmas."""
+
+    @abstractmethod
+    def update_up(self, up: Floats, sigma_rad: float, i_R_j: Floats) -> None:
+        """Update by the direction of the world's up in the body, measured over an interval from i to j."""
+
+    @abstractmethod
+    def update_plane(self, plane: PlanarMotion) -> None:
+        """Update by the plane on which the vehicle stays."""
 
     @abstractmethod
     def pose_after(self, motion: Motion) -> tuple[Floats, Floats, Floats]:
@@ -160,8 +212,8 @@ class FilterShell(ABC):
     def attitude(self) -> Floats:
         """world_R_body of the state, shape (3, 3)."""
 
-    has_bias = False
-    """True where the state has a gyro bias."""
+    def check(self, epoch_ns: int) -> None:
+        """Look at the state after an event."""
 
     def gyro_bias(self) -> Floats:
         """Estimated gyro bias, shape (3,), rad/s; zero where the state has none."""
@@ -180,18 +232,21 @@ class FilterShell(ABC):
             When the state has no meaning any more, or a variance makes an innovation's covariance not positive.
         """
         require_measurements(measurements, self.name)
-        end_ns, detections = measurements.end_ns, measurements.detections
+        end_ns = measurements.end_ns
+        detections = measurements.detections
         self.odometry.add(measurements.imu, measurements.dvl)
         depth = self.odometry.used_depths(measurements.depth)
         if self._reached_ns == NOT_STARTED:
             self._start(end_ns)
-        since_ns, self._done_ns = max(self._done_ns, self._reached_ns), max(self._done_ns, end_ns)
+        since_ns = max(self._done_ns, self._reached_ns)
+        self._done_ns = max(self._done_ns, end_ns)
         ids, views = self._views(detections, since_ns)
         estimate = None
         try:
-            samples = self._samples(measurements, depth, since_ns)
+            samples = self._samples(depth, measurements.heading, measurements.positions, since_ns)
             if end_ns >= max(self._reached_ns, self.node_ns):
-                estimate = self._use(end_ns, samples, since_ns, ids, views)
+                call = Call(since_ns, end_ns, self.node_ns, self._opened_ns, self._interval_ns)
+                estimate = self._run(call, samples, views)
                 self._estimates.keep(estimate)
         except np.linalg.LinAlgError as error:
             raise EstimatorError(
@@ -221,32 +276,27 @@ class FilterShell(ABC):
         return self._journal.log()
 
     def withheld(self) -> list[str]:
-        """Messages about headings and fixes that the state contradicts, and detections outside the gate (`admit`)."""
-        log = self.detections()
-        let_in = [
-            stamp for stamp, why in zip(log.stamps_ns.tolist(), log.outcomes, strict=True) if why is Outcome.LET_IN
-        ]
-        if not let_in:
-            return self._contradictions.messages()
-        return [
-            *self._contradictions.messages(),
-            f"most of {JUDGED_TOGETHER} detections in a row, of landmarks that had agreed, were outliers, first at"
-            f" {let_in[0] * 1e-9:.3f} s, so {len(let_in)} were used outside the gate: the filter was wrong, not they,"
-            " and the gate may be the cause; give gate_probability = 1, or larger noise",
-        ]
+        """Messages about headings, fixes and detections that the state contradicts."""
+        messages = self._contradictions.messages()
+        if math.isfinite(self.sonar.gate) or math.isfinite(self.sonar.kernel_width):
+            messages += lockout_messages(self.detections())
+        return messages
 
     def refused_rows(self) -> list[RefusedRow]:
         """Rows of all sensors but the sonar that are not used, with the reason."""
         return self.odometry.refused + self._refused
 
-    # ---------------------------------------------------------------- events
+    # ---------------------------------------------------------------- measurements of a call
 
     def _start(self, end_ns: int) -> None:
         """Set the state's epoch to the first one, if it is reached."""
-        if (start_ns := self.odometry.start_by(end_ns)) is None:
+        start_ns = self.odometry.start_by(end_ns)
+        if start_ns is None:
             return
         self._reached_ns = self.odometry.reached_ns(start_ns)
-        self.node_ns = self._opened_ns = self._kept_ns = start_ns
+        self.node_ns = start_ns
+        self._opened_ns = start_ns
+        self._kept_ns = start_ns
         self._opened_velocity = self.odometry.velocity_at_imu(start_ns)
 
     def _views(self, detections: LandmarkDetections | None, since_ns: int) -> tuple[Ints, Views]:
@@ -256,185 +306,265 @@ class FilterShell(ABC):
         """
         if detections is None:
             return NO_STAMPS, NO_VIEWS
-        n, stamps_ns = len(detections), detections.stamps_ns
-        ids, outcome = identify(detections, self._minimum_id_probability)
+        stamps_ns = detections.stamps_ns
+        ids, outcome = identify(detections, self.params.minimum_id_probability)
         if stamps_ns[0] < since_ns:
             outcome[stamps_ns < since_ns] = OUTCOME_NUMBERS[Outcome.LATE]
             outcome[stamps_ns < self._reached_ns] = OUTCOME_NUMBERS[Outcome.UNLOCATED]
-        landmark = np.array([-1 if self._was_lost else self._slots.get(i, -1) for i in ids.tolist()])
-        z, R_z = read(detections.range_m, detections.azimuth_rad, detections.range_azimuth_cov, self.sonar.R_z)
-        e, S = np.empty((n, 2)), np.empty((n, 2, 2))
-        e[:] = S[:] = math.nan
-        return ids, Views(stamps_ns, landmark, z, R_z, outcome, e, S)
+        slot = np.full(len(ids), -1)
+        for row in np.flatnonzero(outcome == ACCEPTED).tolist():
+            # a new landmark gets the next number: rows are used in their order
+            slot[row] = self._slots.setdefault(int(ids[row]), len(self._slots))
+        z, R_z = read_detections(detections.range_m, detections.azimuth_rad, detections.range_azimuth_cov, self._R_z)
+        e = np.full((len(ids), 2), math.nan)
+        S = np.full((len(ids), 2, 2), math.nan)
+        return ids, Views(stamps_ns, slot, z, R_z, outcome, e, S)
 
-    def _samples(self, measurements: Measurements, depth: Depth | None, since_ns: int) -> dict[int, Any]:
-        """Samples of a call, a block for each kind. Unsound and late rows are refused, but a late fix is used.
+    def _samples(
+        self, depth: Depth | None, heading: Heading | None, fixes: PositionFixes | None, since_ns: int
+    ) -> Samples:
+        """Samples of a call with their noise, in order. Unsound and late rows are refused, but a late fix is used.
 
         Rows before the first epoch is reached are passed over.
         """
-        samples: dict[int, Any] = {}
-        heading, fixes = measurements.heading, measurements.positions
-        given: list[tuple[int, str, Any]] = [(DEPTH, "depth", depth), (HEADING, "heading", heading)]
-        for kind, sensor, block in [*given, (FIX, "positions", fixes)]:
-            if block is None:
-                continue
-            is_sound = np.ones(len(block), np.bool_) if kind == DEPTH else block.are_sound()
-            is_late = block.stamps_ns < since_ns
-            for row in np.flatnonzero((~is_sound | is_late) & (block.stamps_ns >= self._reached_ns)).tolist():
-                if not (is_sound[row] and kind == FIX and self._use_late(block, row, since_ns)):
-                    reason = Refusal.LATE if is_sound[row] else Refusal.UNSOUND
-                    self._refused.append(RefusedRow(sensor, int(block.stamps_ns[row]), reason, math.nan))
-            if (is_used := is_sound & ~is_late).any():
-                samples[kind] = block.rows(is_used)
-        return samples
+        blocks = []
+        if depth is not None:  # the odometry has refused its unsound rows
+            blocks.append(self._in_time(self._depths(depth), np.ones(len(depth), np.bool_), since_ns))
+        if heading is not None:
+            blocks.append(self._in_time(self._headings(heading), heading.are_sound(), since_ns))
+        if fixes is not None:
+            blocks.append(self._in_time(self._fixes(fixes), fixes.are_sound(), since_ns))
+        if not blocks:
+            return NO_SAMPLES
+        if len(blocks) == 1:
+            return blocks[0]
+        samples = Samples(*(np.concatenate(columns) for columns in zip(*blocks, strict=True)))
+        order = np.argsort(samples.stamp_ns, kind="stable")
+        return Samples(*(column[order] for column in samples))
 
-    def _use_late(self, fixes: PositionFixes, row: int, since_ns: int) -> bool:
-        """Update by a fix of an earlier instant i, by the motion backwards; False where rows of its time are gone.
+    def _depths(self, depth: Depth) -> Samples:
+        """Depths, with the calibration's noise where they have none."""
+        value = np.zeros((len(depth), 3))
+        noise = np.zeros((len(depth), 3, 3))
+        value[:, 2] = depth.z_m
+        variance_m2 = depth.variance_m2
+        noise[:, 2, 2] = np.where(np.isnan(variance_m2), self.calibration.depth.sigma_m**2, variance_m2)
+        return _samples(depth.stamps_ns, DEPTH, value, noise)
 
-        From epoch j the antenna was then at ``j_T_i l``, with covariance ``Ad(i_T_j) C Ad(i_T_j)^T``. The state
-        shares the error of this motion, which is left out: the fix tells rather too little.
-        """
-        stamp_ns, node_ns = int(fixes.stamps_ns[row]), self.node_ns
-        if stamp_ns < node_ns - KEPT_NS:
-            return False
-        first_ns, last_ns = min(stamp_ns, node_ns), max(stamp_ns, node_ns)
-        bias, attitude = self.gyro_bias(), self.attitude()
-        between = self.odometry.motion(first_ns, last_ns, bias, attitude, since_ns)
-        if stamp_ns < node_ns:  # the attitude is that of its end
-            attitude = attitude @ between.i_T_j.rotation().matrix().T
-            between = self.odometry.motion(first_ns, last_ns, bias, attitude, since_ns)
-        T, C, D = between.i_T_j, between.covariance, between.D_bias
-        if stamp_ns < node_ns:
-            A = T.AdjointMap()
-            T, C, D = T.inverse(), A @ C @ A.T, -A @ D
-        self._fix(Motion(np.ascontiguousarray(T.rotation().matrix()), T.translation(), C, D, NO_BIAS), fixes, row)
-        return True
+    def _headings(self, heading: Heading) -> Samples:
+        """Headings, with the calibration's noise where they have none."""
+        value = np.zeros((len(heading), 3))
+        noise = np.zeros((len(heading), 3, 3))
+        value[:, 0] = heading.yaw_rad
+        sigma_rad = heading.sigma_rad
+        noise[:, 0, 0] = np.where(np.isnan(sigma_rad), self.calibration.heading.sigma_rad, sigma_rad) ** 2
+        return _samples(heading.stamps_ns, HEADING, value, noise)
 
-    def _fix(self, motion: Motion, fixes: PositionFixes, row: int) -> None:
-        """Update by a position fix, with the calibration's noise where it has none."""
-        cov_m2, known = fixes.covariance_m2[row], self.calibration.positions
-        cov_m2 = np.diag(np.square(known.sigma_m)) if np.isnan(cov_m2).any() else cov_m2
-        antenna, (R, X, P) = np.array(known.antenna_m), self.pose_after(motion)
-        e, H = fixes.position_m[row] - X - R @ antenna, R @ np.hstack((-cross_matrix(antenna), np.eye(3)))
-        self._contradictions.judge("positions", math.sqrt(e @ np.linalg.solve(H @ P @ H.T + cov_m2, e)))
-        self.correct_position(motion, antenna, fixes.position_m[row], cov_m2)
+    def _fixes(self, fixes: PositionFixes) -> Samples:
+        """Position fixes, with the calibration's noise where they have none."""
+        noise = fixes.covariance_m2.copy()
+        noise[np.isnan(noise).any(axis=(1, 2))] = np.diag(np.square(self.calibration.positions.sigma_m))
+        return _samples(fixes.stamps_ns, FIX, fixes.position_m, noise)
 
-    def _turn(self, motion: Motion, heading: Heading, row: int) -> None:
-        """Update by a heading, with the calibration's noise where it has none."""
-        sigma_rad = float(heading.sigma_rad[row])
-        sigma_rad = self.calibration.heading.sigma_rad if math.isnan(sigma_rad) else sigma_rad
-        yaw_rad, (R, _, P) = float(heading.yaw_rad[row]), self.pose_after(motion)
-        predicted_rad, by_turn = yaw_and_derivative(R)
-        variance_rad2 = by_turn @ P[:3, :3] @ by_turn + sigma_rad**2 + self.calibration.heading.bias_sigma_rad**2
-        self._contradictions.judge("heading", abs(wrap_angle(yaw_rad - predicted_rad)) / math.sqrt(variance_rad2))
-        self.correct_heading(motion, yaw_rad, sigma_rad**2)
-
-    def _use(self, end_ns: int, samples: dict[int, Any], since_ns: int, ids: Ints, views: Views) -> Estimate:
-        """Carry the state to the newest epoch reached at the end of the call, with all measurements on the way."""
-        events = self._events(end_ns, samples, since_ns, views)
-        kinds, k = events.kind.tolist(), 0
-        while kinds[k] != END:
-            if kinds[k] == PLANE and self._plane is not None:
-                self.correct_plane(self._plane)
+    def _in_time(self, samples: Samples, is_sound: NDArray[np.bool_], since_ns: int) -> Samples:
+        """The sound rows that are not late; the others are refused, or used if they are late fixes."""
+        is_late = samples.stamp_ns < since_ns
+        is_used = is_sound & ~is_late
+        if is_used.all():
+            return samples
+        for row in np.flatnonzero(~is_used & (samples.stamp_ns >= self._reached_ns)).tolist():
+            kind = int(samples.kind[row])
+            stamp_ns = int(samples.stamp_ns[row])
+            if is_sound[row] and kind == FIX and stamp_ns >= self.node_ns - KEPT_NS:
+                self._use_late(stamp_ns, samples.value[row], samples.noise[row], since_ns)
             else:
-                if math.isnan(events.dp[k, 0]):
-                    self._bridge(events, k)
-                used_until = self.advance(events, k)
-                if used_until > k:
-                    k = used_until
-                    continue
-                motion, row = self.motion_to(events, k), int(events.row[k])
-                if kinds[k] == FRAME:
-                    self._see(ids, motion, views, row)
-                elif kinds[k] == HEADING:
-                    self._turn(motion, samples[HEADING], row)
-                elif kinds[k] == FIX:
-                    self._fix(motion, samples[FIX], row)
-                else:
-                    raise EstimatorError(f"{self.name}: the motion to {events.end_ns[k]} ns over a gap is not finite")
-            k += 1
-        if math.isnan(events.dp[k, 0]):
-            self._bridge(events, k)
-        self.node_ns = int(events.start_ns[k])
-        R, X, covariance = self.pose_after(self.motion_to(events, k))
+                reason = Refusal.LATE if is_sound[row] else Refusal.UNSOUND
+                self._refused.append(RefusedRow(SENSORS[kind], stamp_ns, reason, math.nan))
+        return _rows(samples, is_used)
+
+    # ---------------------------------------------------------------- events of a call
+
+    def _run(self, call: Call, samples: Samples, views: Views) -> Estimate:
+        """Carry the state to the newest epoch reached at the end of the call, with all measurements on the way."""
+        epochs_ns, reached_ns = self.odometry.epochs_reached(self.node_ns, call.end_ns)
+        order = Order(*in_order(epochs_ns, reached_ns, samples.stamp_ns, samples.kind, views, call))
+        motions = self.odometry.motions(order.start_ns, order.end_ns, order.stamp_ns, NO_BIAS)
+        is_gap = np.isnan(motions.dp[:, 0]).tolist()
+        events = zip(order.kind.tolist(), order.row.tolist(), zip(*motions, strict=True), strict=True)
+        for k, (kind, row, columns) in enumerate(events):
+            motion = self._bridge(order, k, views) if is_gap[k] else self._reduced(Motion(*columns))
+            if kind == EPOCH:
+                self._to_epoch(motion, int(order.end_ns[k]), ends_interval=order.ends_interval[k])
+            elif kind == FRAME:
+                self._see(motion, views, row)
+            elif kind == DEPTH:
+                self.update_depth(motion, samples.value[row, 2], samples.noise[row, 2, 2])
+            elif kind == HEADING:
+                distance = self.update_heading(motion, samples.value[row, 0], samples.noise[row, 0, 0])
+                self._contradictions.judge("heading", distance)
+            elif kind == FIX:
+                distance = self.update_position(motion, samples.value[row], samples.noise[row])
+                self._contradictions.judge("positions", distance)
+            self.check(self.node_ns)
+        R, X, covariance = self.pose_after(motion)
         self.odometry.settle(self.node_ns)
         if self.node_ns > self._kept_ns + KEPT_NS:
             self.odometry.forget_before(self.node_ns - KEPT_NS)
             self._kept_ns = self.node_ns
-        return Estimate(end_ns, gtsam.Pose3(gtsam.Rot3(R), X), covariance)
+        return Estimate(call.end_ns, gtsam.Pose3(gtsam.Rot3(R), X), covariance)
 
-    def _events(self, end_ns: int, samples: dict[int, Any], since_ns: int, views: Views) -> Events:
-        """What happens up to the end of a call, from the state's epoch on."""
-        epochs_ns, reached_ns = self.odometry.epochs_reached(self.node_ns, end_ns)
-        depth, ordered = samples.get(DEPTH), NO_SAMPLES
-        z_m, variance_m2 = (NO_DEPTH, NO_DEPTH) if depth is None else (depth.z_m, depth.variance_m2)
-        if samples:
-            rows = [(block.stamps_ns, [kind] * len(block), range(len(block))) for kind, block in samples.items()]
-            ordered = np.concatenate([np.array(columns) for columns in rows], axis=1)
-            ordered = np.take(ordered, np.argsort(ordered[0], kind="stable"), axis=1)
-        columns = np.empty((5, 3 * len(epochs_ns) + ordered.shape[1] + len(views.stamp_ns) + 1), np.int64)
-        n = in_order(
-            epochs_ns, reached_ns, ordered, views.stamp_ns, views.outcome, since_ns, end_ns,
-            self.node_ns, self._opened_ns, self._interval_ns, self._plane is not None, columns,
-        )  # fmt: skip
-        stamp_ns, start_ns, until_ns, kind, row = columns[:, :n]
-        motions = self.odometry.motions(start_ns, until_ns, stamp_ns, NO_BIAS)
-        gravity, has_rate = NO_GRAVITY, np.ones(n, np.bool_) if self._has_rate else np.zeros(n, np.bool_)
-        if GRAVITY in kind.tolist():
-            gravity = self._gravity(until_ns[kind == GRAVITY].tolist())
-        happening = stamp_ns, start_ns, until_ns, kind, row, *motions, has_rate
-        return Events(*happening, z_m, variance_m2, gravity, *views)
+    def _reduced(self, motion: Motion) -> Motion:
+        """The motion without the gyro bias of the state and the Earth's rate."""
+        if not self._has_rate:
+            return motion
+        return remove_rate(motion, self.gyro_bias(), self.attitude().T @ self._earth)
 
-    def _gravity(self, epochs_ns: list[int]) -> Floats:
-        """Intervals of gravity that end at epochs, as `Events.gravity`."""
-        intervals = []
-        for epoch_ns in epochs_ns:
-            duration_s, (velocity_i, variance_i) = (epoch_ns - self._opened_ns) * 1e-9, self._opened_velocity
-            velocity_j, variance_j = self._opened_velocity = self.odometry.velocity_at_imu(epoch_ns)
+    def _to_epoch(self, motion: Motion, epoch_ns: int, *, ends_interval: bool) -> None:
+        """Predict to an epoch, and correct there by the plane, and by gravity where an interval of it ends."""
+        self.predict(motion, (epoch_ns - self.node_ns) * 1e-9)
+        self.node_ns = epoch_ns
+        self._impulse = self._impulse + self._turned @ motion.impulse
+        self._turned = self._turned @ motion.dR
+        if self.calibration.planar is not None:
+            self.update_plane(self.calibration.planar)
+        if ends_interval:
+            self._level(epoch_ns)
+
+    def _level(self, epoch_ns: int) -> None:
+        """Update by gravity over the interval that ends at an epoch; the next one begins."""
+        duration_s = (epoch_ns - self._opened_ns) * 1e-9
+        velocity_i, variance_i = self._opened_velocity
+        velocity_j, variance_j = self.odometry.velocity_at_imu(epoch_ns)
+        up = up_direction(self._impulse / duration_s, self._turned, velocity_i, velocity_j, duration_s)
+        if not math.isnan(up[0]):
             velocity_sigma = math.sqrt(0.5 * (variance_i + variance_j))
-            sigma = tilt_sigma(duration_s, velocity_sigma, self.calibration, has_bias=not self.has_bias)
-            intervals.append((*velocity_i.tolist(), *velocity_j.tolist(), duration_s, sigma))
-            self._opened_ns = epoch_ns
-        return np.array(intervals)
+            sigma_rad = tilt_sigma(duration_s, velocity_sigma, self.calibration, has_bias=not self.has_bias)
+            self.update_up(up, sigma_rad, self._turned)
+        self._opened_ns = epoch_ns
+        self._opened_velocity = (velocity_j, variance_j)
+        self._turned = np.eye(3)
+        self._impulse = np.zeros(3)
 
-    def motion_to(self, events: Events, k: int) -> Motion:
-        """Motion to an event, without the gyro bias of the state and the Earth's rate."""
-        motion = Motion(*(column[k] for column in events[5:10]))
-        if events.has_rate[k]:
-            dR, dp, _, D, impulse = motion
-            remove_rate(dR, dp, D, impulse, self.gyro_bias(), self.attitude().T @ self.earth)
-            events.has_rate[k] = False
-        return motion
-
-    def _bridge(self, events: Events, k: int) -> None:
-        """Write the motion over a gap, with the share of its error that the measurements of one more event may have.
-
-        A state without bias has no place for what an unknown one does in a gap, where it tilts gravity: it is added to
-        the covariance of the displacement. Elsewhere its drift is left out, as published.
-        """
-        stamp_ns, start_ns, end_ns, kind, row = (int(column[k]) for column in events[:5])
-        over = self.odometry.motion(start_ns, end_ns, self.gyro_bias(), self.attitude(), stamp_ns)
-        C, D = over.covariance.copy(), over.D_bias
-        if not self.has_bias:
-            C[3:, 3:] += self.calibration.imu.gyro_bias_sigma**2 * D[3:] @ D[3:].T
-        if DEPTH <= kind <= FRAME:
-            more = len(accepted_rows(events.seen_ns, events.outcome, row)) if kind == FRAME else 1
-            self._in_gap[start_ns, kind] = count = self._in_gap.get((start_ns, kind), 0) + more
-            C *= count * (count + 1)
-        events.has_rate[k] = False
-        if kind != END:  # asking for an estimate changes nothing
-            self._was_lost, events.landmark[:] = True, -1
-        events.dR[k], events.dp[k] = over.i_T_j.rotation().matrix(), over.i_T_j.translation()
-        events.C[k], events.D[k], events.impulse[k] = C, D, over.mean_specific_force * over.duration_s
-
-    def _see(self, ids: Ints, motion: Motion, views: Views, first: int) -> None:
-        """Update by the landmarks of a frame, or append them at first sight."""
-        for row in accepted_rows(views.stamp_ns, views.outcome, first):
-            landmark_id, z, R_z = int(ids[row]), views.z[row], views.R_z[row]
-            if landmark_id not in self._slots:
+    def _see(self, motion: Motion, views: Views, first: int) -> None:
+        """Update by the known landmarks of a frame and append the new ones, in the order of their rows."""
+        for row in in_frame(views, first):
+            z = views.z[row]
+            R_z = views.R_z[row]
+            slot = int(views.slot[row])
+            if slot == self._landmarks:
                 self.augment(motion, z, R_z)
-                self._slots[landmark_id], views.outcome[row] = len(self._slots), NEW
+                self._landmarks += 1
+                views.outcome[row] = NEW
                 continue
-            slot = self._slots[landmark_id]
-            told = self.observe(motion, slot, z, R_z, may_be_far=self._was_lost)
-            views.outcome[row], views.e[row], views.S[row] = told
+            judged = self.observe_far(motion, slot, z, R_z) if self._may_be_far else None
+            judged = judged or self.observe(motion, slot, z, R_z)
+            views.outcome[row], views.e[row], views.S[row] = judged
+
+    def _bridge(self, order: Order, k: int, views: Views) -> Motion:
+        """Motion over a gap, with the share of its error that the measurements of one more event may have.
+
+        Measurements that are related to one epoch over the same gap of the Doppler log share its error. The k-th gets
+        ``k (k + 1)`` times the motion's covariance: together those of one kind, such as depths or detections, inform no
+        more than one exact measurement, ``sum 1 / (k (k + 1)) = 1``.
+
+        In a state without bias an unknown one, which tilts gravity, adds to the covariance of the displacement.
+        """
+        kind = int(order.kind[k])
+        end_ns = int(order.end_ns[k])
+        over = self.odometry.motion(self.node_ns, end_ns, self.gyro_bias(), self.attitude(), int(order.stamp_ns[k]))
+        motion = motion_of(over)
+        if not np.isfinite(motion.dp).all():
+            raise EstimatorError(f"{self.name}: the motion to {end_ns} ns over a gap is not finite")
+        C = motion.C.copy()
+        if not self.has_bias:
+            C[3:, 3:] += self.calibration.imu.gyro_bias_sigma**2 * motion.D[3:] @ motion.D[3:].T
+        if kind in (DEPTH, HEADING, FIX, FRAME):
+            more = len(in_frame(views, int(order.row[k]))) if kind == FRAME else 1
+            count = self._used_in_gap.get((self.node_ns, kind), 0) + more
+            self._used_in_gap[self.node_ns, kind] = count
+            C *= count * (count + 1)
+        if kind != END:  # an estimate alone changes nothing
+            self._may_be_far = self.params.far_views
+        return motion._replace(C=C)
+
+    def _use_late(self, stamp_ns: int, position_m: Floats, noise: Floats, since_ns: int) -> None:
+        """Update by a fix of an earlier instant i, by the motion backwards.
+
+        From epoch j the antenna was then at ``j_T_i l``, with covariance ``Ad(i_T_j) C Ad(i_T_j)^T``. The state
+        shares the error of this motion, which is left out: the fix informs rather too little.
+        """
+        first_ns = min(stamp_ns, self.node_ns)
+        last_ns = max(stamp_ns, self.node_ns)
+        attitude = self.attitude()
+        between = self.odometry.motion(first_ns, last_ns, self.gyro_bias(), attitude, since_ns)
+        motion = motion_of(between)
+        if stamp_ns < self.node_ns:
+            # the attitude is that at the end of the motion: take it back to the start
+            attitude = attitude @ motion.dR.T
+            between = self.odometry.motion(first_ns, last_ns, self.gyro_bias(), attitude, since_ns)
+            motion = backwards(between)
+        self._contradictions.judge("positions", self.update_position(motion, position_m, noise))
+
+
+def motion_of(over: PreintegratedMotion) -> Motion:
+    """The motion as arrays."""
+    return Motion(
+        dR=np.ascontiguousarray(over.i_T_j.rotation().matrix()),
+        dp=np.array(over.i_T_j.translation()),
+        C=np.ascontiguousarray(over.covariance),
+        D=np.ascontiguousarray(over.D_bias),
+        impulse=over.mean_specific_force * over.duration_s,
+    )
+
+
+def backwards(over: PreintegratedMotion) -> Motion:
+    """The motion from its end to its start, with covariance and derivative; without the specific force."""
+    A = over.i_T_j.AdjointMap()
+    back = over.i_T_j.inverse()
+    return Motion(
+        dR=np.ascontiguousarray(back.rotation().matrix()),
+        dp=np.array(back.translation()),
+        C=np.ascontiguousarray(A @ over.covariance @ A.T),
+        D=np.ascontiguousarray(-A @ over.D_bias),
+        impulse=np.full(3, math.nan),
+    )
+
+
+OUTLYING = math.sqrt(-2.0 * math.log(0.001))
+"""Mahalanobis distance that one right detection in a thousand exceeds."""
+OUTLIERS = 0.1
+"""Share of wrong detections that a gate or a kernel is for; three times the largest of our recordings."""
+
+
+def lockout_messages(log: DetectionLog) -> list[str]:
+    """A message where far more detections are outliers than noise and a share `OUTLIERS` of wrong ones explain.
+
+    Of n detections that is more than the mean and four standard deviations of a binomial distribution.
+    """
+    has_innovation = ~np.isnan(log.innovations[:, 0])
+    e = log.innovations[has_innovation]
+    S = log.innovation_covs[has_innovation]
+    squared = np.einsum("ni,ni->n", e, np.linalg.solve(S, e[:, :, None])[:, :, 0])
+    outliers = int(np.count_nonzero(squared > OUTLYING**2))
+    share = OUTLIERS + (1.0 - OUTLIERS) * 0.001
+    explained = share * len(e) + 4.0 * math.sqrt(share * (1.0 - share) * len(e))
+    if outliers <= explained:
+        return []
+    return [
+        f"{outliers} of {len(e)} detections of known landmarks lie outside the 99.9 % ellipse of their innovation, far"
+        " more than noise and a tenth of wrong detections explain: the filter is wrong, not they, and its gate or kernel"
+        " keeps right detections from correcting it; give gate_probability = 1 and kernel_width = 0, or larger noise"
+    ]
+
+
+SENSORS = {DEPTH: "depth", HEADING: "heading", FIX: "positions"}
+"""Names in `RefusedRow`."""
+
+
+def _samples(stamps_ns: Ints, kind: int, value: Floats, noise: Floats) -> Samples:
+    n = len(stamps_ns)
+    return Samples(stamps_ns, np.full(n, kind), value, noise)
+
+
+def _rows(samples: Samples, selection: slice | NDArray[np.bool_]) -> Samples:
+    return Samples(*(column[selection] for column in samples))

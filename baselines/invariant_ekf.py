@@ -1,22 +1,325 @@
-"""Right-invariant EKF-SLAM with the biases of gyros and accelerometers in its state, the strongest filter here.
+"""Right-invariant EKF-SLAM with the biases of gyros and accelerometers in its state: equations and estimator.
 
-Equations: `baselines.invariant_equations`; docs/theory/invariant_ekf.md.
+The state is a rotation and 1 + N points that turn with the world, one element of SE_{1+N}(3), and the biases b of
+`sonar_graph.models.biases`. The error is right-invariant::
+
+    R = Exp(theta) R^,    x_k = Exp(theta) x_k^ + J_l(theta) xi_k,    b = b^ + beta                            (1)
+
+with x_0 = X the body, and P the covariance of ``xi = [theta, beta, xi_0, ..., xi_N]``. Prediction over a motion
+(dR, dp) with perturbation ``eps = [theta_j, rho]`` in its last frame, ``D = d eps / d b``, ``C = cov(eps)``::
+
+    R' = R dR,    X' = X + R dp                                                                                (2)
+    xi' = xi + J (D beta + eps)                                                                                (3)
+    rows of J:    theta [R' 0],  beta [0 0],  xi_0 [[X']x R'  R'],  xi_k [[x_k]x R'  0]
+
+A measurement is taken a motion after the state, at R', X': H is its derivative by xi, H_b that by eps, and ::
+
+    H_beta = H_b D                                                                                             (4)
+
+Landmark k in range and azimuth, H_p their derivative by the point in the world::
+
+    H_theta = 0,    H_xi_k = H_p = -H_xi_0                                                                     (5)
+
+New landmark at ``g = X' + R' q(z)``, q the point of the body that is seen at z = (range, azimuth, elevation)::
+
+    xi_new = xi_0 + G_b eps + G_z dz                                                                           (6)
+
+Position of ``a = X' + R' q``, k = 0, or of a landmark ``a = x_k``, of which H_b is zero; heights are their last rows::
+
+    H_theta = -[a]x,    H_xi_k = I                                                                             (7)
+
+Direction u of the world's up in the body, tilted by A times the bias a of the accelerometers, and the innovation
+covariance::
+
+    y = (R (u - A a))_xy = [ -theta_y, theta_x ] + (R A beta_a)_xy + noise                                     (8)
+    S = H P H^T + H_b C H_b^T + R_z                                                                            (9)
+
+Compass, with the derivative h of the yaw by a turn in the body, and its bias c in b::
+
+    psi' + c,    H_theta = h R'^T,    H_c = 1,    H_b = [h 0]                                                 (10)
+
+Every H but those of compass and position fixes is zero along a shift of everything in x and y and a turn about the
+vertical, at any estimate, so these unobservable directions stay unobservable. Derivation: docs/theory/invariant_ekf.md.
 """
 
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
-from baselines import invariant_equations as equations
-from baselines.event_order import DEPTH, EPOCH, GRAVITY, Events, Motion, add_force, up_at_end
+from baselines.events import Motion, Sonar, elevation_of_new
 from baselines.filter import FilterParams, FilterShell
-from baselines.invariant_equations import BARE, BETA, BODY, EYE, THETA, UP, InvariantState
-from baselines.sonar_update import GATED, admit, far_view, polar_covariance
+from baselines.kalman import (
+    GATED,
+    Judged,
+    bordered,
+    correction,
+    distance,
+    far_covariance,
+    is_far,
+    judged,
+    judged_far,
+    polar_covariance,
+    symmetric,
+)
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
 from sonar_graph.measurements import Floats
-from sonar_graph.models import BIASES, FLOOR_GATE, bias_sigmas, doubted, gyro_bias_of, wrap_angle
+from sonar_graph.models import (
+    ACCEL,
+    BIASES,
+    COMPASS,
+    FLOOR_GATE,
+    SCALE,
+    bias_jacobian,
+    bias_sigmas,
+    body_point_jacobian,
+    gyro_bias_of,
+    huber_scale,
+    locate_from_body,
+    view_from_body,
+    wrap_angle,
+    yaw_and_derivative,
+)
 from sonar_graph.motion import MotionSource
+from sonar_graph.numerics import compiled, cross_matrix, left_jacobian, rotation_exp
+
+THETA, BETA, BODY = slice(0, 3), slice(3, 3 + BIASES), slice(3 + BIASES, 6 + BIASES)
+"""Places of theta, beta and xi_0 in xi."""
+BARE, POINT = 6 + BIASES, 3
+"""Length of xi without landmarks, and of one xi_k."""
+BETA_ACCEL = slice(3 + ACCEL.start, 3 + ACCEL.stop)
+BETA_COMPASS = 3 + COMPASS
+NO_UP = np.zeros(3)
+
+
+class InvariantState(NamedTuple):
+    """Estimate and covariance."""
+
+    R: Floats
+    """world_R_body, shape (3, 3)."""
+    points: Floats
+    """Positions of the body and of the landmarks, shape (1 + N, 3), m."""
+    bias: Floats
+    """b of `sonar_graph.models.biases`, shape (11,)."""
+    P: Floats
+    """Covariance of xi, shape (17 + 3 N, 17 + 3 N)."""
+    body_p_dvl: Floats
+    """Doppler log in the body, shape (3,), m."""
+    is_level: bool
+    """True where gravity levels the vehicle."""
+
+
+def place_of(k: int) -> slice:
+    """Place of xi_k in xi."""
+    return slice(BODY.start + POINT * k, BODY.stop + POINT * k)
+
+
+# -------------------------------------------------------------------------------- prediction
+
+
+@compiled
+def up_in_body(state: InvariantState) -> Floats:
+    """The world's up in the body as it splits the gyros' bias, shape (3,); zero without gravity."""
+    return state.R[2].copy() if state.is_level else np.zeros(3)
+
+
+@compiled
+def pose_after(state: InvariantState, motion: Motion) -> tuple[Floats, Floats, Floats]:
+    """R' (3, 3) and X' (3,) of (2), without the scale error of the Doppler log, and D (6, 11)."""
+    D = bias_jacobian(motion.D, motion.dR, motion.dp, up_in_body(state), state.R[2], state.body_p_dvl)
+    R = state.R @ motion.dR
+    X = state.points[0] + state.R @ motion.dp + R @ (D[3:, SCALE] * state.bias[SCALE])
+    return R, X, D
+
+
+@compiled
+def predict(state: InvariantState, motion: Motion, walk_variance: Floats) -> None:
+    """Carry estimate and covariance over a motion, (2) and (3): ``P <- F P F^T + J C J^T``, ``F = I + J D E_beta``.
+
+    ``walk_variance``: of the biases since, shape (11,).
+    """
+    R, X, D = pose_after(state, motion)
+    state.R[:] = R
+    state.points[0] = X
+    P = state.P
+    J = np.zeros((len(P), 6))
+    J[THETA, :3] = R
+    J[BODY, 3:] = R
+    for k in range(len(state.points)):
+        J[BODY.start + POINT * k : BODY.stop + POINT * k, :3] = cross_matrix(state.points[k]) @ R
+    JD = J @ D
+    # F P F^T = P + M + M^T, with half of what is quadratic in J in M
+    M = JD @ (P[BETA] + 0.5 * P[BETA, BETA].copy() @ JD.T) + J @ (0.5 * motion.C @ J.T)
+    P += M + M.T
+    for i in range(BIASES):
+        P[BETA.start + i, BETA.start + i] += walk_variance[i]
+
+
+# -------------------------------------------------------------------------------- update
+
+
+@compiled
+def update(state: InvariantState, H: Floats, e: Floats, R: Floats) -> None:
+    """Update by an innovation: ``xi = K e`` moves the estimate by (1), ``P <- P - K S K^T``."""
+    xi = correction(state.P, H, e, R)
+    Exp = rotation_exp(xi[THETA])
+    state.R[:] = Exp @ state.R
+    state.points[:] = state.points @ Exp.T + xi[BODY.start :].reshape(-1, POINT) @ left_jacobian(xi[THETA]).T
+    state.bias[:] += xi[BETA]
+
+
+@compiled
+def observe(
+    state: InvariantState, k: int, motion: Motion, sonar: Sonar, z: Floats, R_z: Floats
+) -> tuple[int, Floats, Floats]:
+    """Update by range and azimuth of a known landmark, (5); outcome, innovation and its covariance."""
+    at = BODY.start + POINT * k
+    R, X, D = pose_after(state, motion)
+    z_hat, H_b, H_p = view_from_body(R, X, sonar.mount, state.points[k])
+    e = z - z_hat
+    e[1] = wrap_angle(e[1])
+    H = np.zeros((2, len(state.P)))
+    H[:, at : at + POINT] = H_p
+    H[:, BODY] = -H_p
+    H[:, BETA] = H_b @ D  # (4)
+    noise = H_b @ motion.C @ H_b.T + R_z
+    S = symmetric(H @ state.P @ H.T + noise)  # (9)
+    outcome, widened = judged(e, S, R_z, sonar.gate, sonar.kernel_width)
+    if outcome != GATED:
+        update(state, H, e, noise + widened)
+    return outcome, e, S
+
+
+def observe_far(state: InvariantState, k: int, motion: Motion, sonar: Sonar, z: Floats, R_z: Floats) -> Judged | None:
+    """Update as `observe` by a landmark far from where it is predicted, by the point seen, (6); None if it is near.
+
+    Exp(theta) turns both points: the innovation is ``xi_k - xi_new``, without theta however far they are apart.
+    """
+    at = BODY.start + POINT * k
+    R, X, D = pose_after(state, motion)
+    g, G_b, G_z = locate_from_body(R, X, sonar.mount, z, 0.0)
+    e = g - state.points[k]
+    H = np.zeros((POINT, len(state.P)))
+    H[:, at : at + POINT] = np.eye(3)
+    H[:, BODY] = -np.eye(3)
+    H[:, BETA] = -G_b @ D  # (4)
+    noise = G_b @ motion.C @ G_b.T
+    S = H @ state.P @ H.T + noise
+    if not is_far(S, G_z, z[0], R_z):
+        return None
+    V = G_z @ far_covariance(R_z, z[0], sonar.aperture_rad) @ G_z.T
+    outcome, e_z, S_z, widened = judged_far(e, symmetric(S + V), G_z, R_z, sonar.gate, sonar.kernel_width)
+    if outcome != GATED:
+        update(state, H, e, symmetric(noise + V + widened))
+    return Judged(outcome, e_z, symmetric(S_z))
+
+
+@compiled
+def position_jacobian(state: InvariantState, a: Floats, H_b: Floats, D: Floats) -> Floats:
+    """H of the position a of a point of the body, (7), shape (3, 17 + 3 N)."""
+    H = np.zeros((3, len(state.P)))
+    H[:, THETA] = -cross_matrix(a)
+    H[:, BODY] = np.eye(3)
+    H[:, BETA] = H_b @ D  # (4)
+    return H
+
+
+@compiled
+def update_depth(state: InvariantState, motion: Motion, port: Floats, z_m: float, variance_m2: float) -> None:
+    """Update by the height of the pressure port, (7)."""
+    R, X, D = pose_after(state, motion)
+    a = X + R @ port
+    H_b = body_point_jacobian(R, port)
+    H = position_jacobian(state, a, H_b, D)[2:]
+    H_b = H_b[2:]  # (1, 6)
+    update(state, H, z_m - a[2:], H_b @ motion.C @ H_b.T + variance_m2)
+
+
+def update_heading(
+    state: InvariantState, motion: Motion, yaw_rad: float, variance_rad2: float, bias_variance_rad2: float
+) -> float:
+    """Update by a compass, (10), with Huber's kernel.
+
+    Returns the distance from the yaw in sigmas, in which the bias of the compass is noise of the calibration's variance.
+    """
+    R, _, D = pose_after(state, motion)
+    yaw, by_turn = yaw_and_derivative(R)
+    H_b = np.zeros((1, 6))
+    H_b[0, :3] = by_turn
+    H = np.zeros((1, len(state.P)))
+    H[0, THETA] = R @ by_turn
+    H[:, BETA] = H_b @ D  # (4)
+    noise = H_b @ motion.C @ H_b.T
+    S = H @ state.P @ H.T + noise + variance_rad2 + bias_variance_rad2
+    off = distance(np.array([wrap_angle(yaw_rad - yaw)]), S)
+    H[0, BETA_COMPASS] = 1.0
+    e = np.array([wrap_angle(yaw_rad - yaw - state.bias[COMPASS])])
+    scale = huber_scale(e, H @ state.P @ H.T + noise + variance_rad2)
+    update(state, H, e, noise + scale * variance_rad2)
+    return off
+
+
+def update_position(state: InvariantState, motion: Motion, q: Floats, position_m: Floats, R_z: Floats) -> float:
+    """Update by the position of a point q of the body, (7), with Huber's kernel; the distance in sigmas."""
+    R, X, D = pose_after(state, motion)
+    a = X + R @ q
+    H_b = body_point_jacobian(R, q)
+    H = position_jacobian(state, a, H_b, D)
+    e = position_m - a
+    noise = H_b @ motion.C @ H_b.T
+    S = symmetric(H @ state.P @ H.T + noise + R_z)  # (9)
+    update(state, H, e, noise + huber_scale(e, S) * R_z)
+    return distance(e, S)
+
+
+def update_up(state: InvariantState, up: Floats, by_accel: Floats, sigma_rad: float) -> None:
+    """Update by the direction of the world's up in the body, (8); ``by_accel``: A, shape (3, 3)."""
+    by_bias = state.R @ by_accel
+    y = state.R @ up - by_bias @ state.bias[ACCEL]
+    H = np.zeros((2, len(state.P)))
+    H[0, 1] = -1.0
+    H[1, 0] = 1.0
+    H[:, BETA_ACCEL] = by_bias[:2]
+    update(state, H, y[:2], sigma_rad**2 * np.eye(2))
+
+
+def height_jacobian(state: InvariantState, k: int) -> Floats:
+    """H of the height of x_k, (7), shape (1, 17 + 3 N)."""
+    H = np.zeros((1, len(state.P)))
+    H[0, 0] = state.points[k, 1]
+    H[0, 1] = -state.points[k, 0]
+    H[0, BODY.start + POINT * k + 2] = 1.0
+    return H
+
+
+def update_plane(state: InvariantState, plane: PlanarMotion) -> None:
+    """Update by the plane on which the vehicle stays: height of the body, (7), and tilt, (8)."""
+    e = plane.z_m - state.points[0, 2:]
+    update(state, height_jacobian(state, 0), e, np.array([[plane.z_sigma_m**2]]))
+    update_up(state, np.array([0.0, 0.0, 1.0]), np.zeros((3, 3)), plane.tilt_sigma_rad)
+
+
+# -------------------------------------------------------------------------------- augmentation
+
+
+def augment(state: InvariantState, motion: Motion, sonar: Sonar, z: Floats, R_z: Floats) -> InvariantState:
+    """State with a new landmark, (6), on a floor of known height if it is near."""
+    R, X, D = pose_after(state, motion)
+    g, G_b, G_z = locate_from_body(R, X, sonar.mount, z, elevation_of_new(R, X, sonar, z))
+    G = np.zeros((POINT, len(state.P)))
+    G[:, BODY] = np.eye(3)
+    G[:, BETA] = G_b @ D  # (4)
+    GP = G @ state.P
+    V = G_z @ polar_covariance(R_z, sonar.aperture_rad) @ G_z.T
+    P = bordered(state.P, GP, symmetric(GP @ G.T + G_b @ motion.C @ G_b.T + V))
+    state = state._replace(points=np.concatenate((state.points, g.reshape(1, 3))), P=P)
+    k = len(state.points) - 1
+    H = height_jacobian(state, k)
+    e = sonar.floor_z_m - state.points[k, 2:]  # NaN where the floor is not known
+    noise = sonar.floor_variance_m2 * np.eye(1)
+    if e[0] ** 2 <= FLOOR_GATE * (H @ P @ H.T + noise)[0, 0]:
+        update(state, H, e, noise)
+    return state
 
 
 class InvariantEkfParams(FilterParams):
@@ -38,7 +341,7 @@ class InvariantEkf(FilterShell):
       Every motion has its derivatives by them, also over gaps.
     - Attitude is a rotation matrix and has no singular pitch.
 
-    It linearises once, and cannot revise an association. Derivation: docs/theory/invariant_ekf.md; what gravity tells:
+    It linearises once, and cannot revise an association. Derivation: docs/theory/invariant_ekf.md; gravity:
     docs/theory/gravity.md.
 
     Parameters
@@ -53,6 +356,7 @@ class InvariantEkf(FilterShell):
 
     Params: ClassVar[type[Section]] = InvariantEkfParams
     name = "invariant-ekf"
+    has_bias = True
 
     def __init__(
         self, calibration: Calibration, odometry: MotionSource, params: InvariantEkfParams | None = None
@@ -63,125 +367,80 @@ class InvariantEkf(FilterShell):
 
     def state(self) -> tuple[int, InvariantState]:
         """Stamp (ns) and a copy of the state at the newest epoch."""
-        s = self._state
-        return self.node_ns, InvariantState(
-            s.R.copy(), s.points.copy(), s.bias.copy(), s.P.copy(), s.body_p_dvl, s.is_levelled
+        return self.node_ns, self._state._replace(
+            R=self._state.R.copy(),
+            points=self._state.points.copy(),
+            bias=self._state.bias.copy(),
+            P=self._state.P.copy(),
         )
-
-    def attitude(self) -> Floats:
-        """world_R_body of the state, shape (3, 3)."""
-        return self._state.R
-
-    has_bias = True
-
-    def gyro_bias(self) -> Floats:
-        """Estimated gyro bias, shape (3,), rad/s."""
-        return gyro_bias_of(self._state.bias, self._state.up())
 
     def predict(self, motion: Motion, duration_s: float) -> None:
         """Carry the state over the motion to the next epoch, (2) and (3)."""
-        equations.predict(self._state, motion, self._walk_density**2 * duration_s)
+        predict(self._state, motion, self._walk_density**2 * duration_s)
 
-    def advance(self, events: Events, k: int) -> int:
-        """Predict over epochs and correct by depth, from event k on."""
-        while events.kind[k] in (EPOCH, GRAVITY, DEPTH) and not np.isnan(events.dp[k, 0]):
-            motion, row = self.motion_to(events, k), events.row[k]
-            if events.kind[k] == GRAVITY:
-                mean_R = 0.5 * (EYE + self.turned.T)
-                up = up_at_end(self.turned, self.impulse, events.gravity[row])
-                if not np.isnan(up[0]):
-                    self.correct_up(up, events.gravity[row, 7], mean_R / self.calibration.gravity_m_s2)
-            elif events.kind[k] == EPOCH:
-                self.predict(motion, (events.end_ns[k] - events.start_ns[k]) * 1e-9)
-                add_force(self.turned, self.impulse, motion.dR, motion.impulse)
-            else:
-                variance_m2 = events.variance_m2[row]
-                self.correct_depth(
-                    motion, events.z_m[row], self.depth_variance if np.isnan(variance_m2) else variance_m2
-                )
-            k += 1
-        return k
+    def observe(self, motion: Motion, slot: int, z: Floats, R_z: Floats) -> Judged:
+        """Update by range and azimuth of a known landmark, (5)."""
+        return Judged(*observe(self._state, 1 + slot, motion, self.sonar, z, R_z))
 
-    def correct_up(self, up: Floats, sigma: float, by_accel: Floats) -> None:
-        """Update by the world's up in the body, shape (3,), with the sigma of its tilt, rad, (8)."""
-        y, H = equations.up_innovation(self._state, up, by_accel)
-        equations.correct(self._state, *equations.innovation_covariance(self._state, H, sigma**2 * np.eye(2)), y)
-
-    def correct_height(self, k: int, z_m: float, variance_m2: float, gate: float = np.inf) -> None:
-        """Update by the height of the body (k = 0) or a landmark within a gate, (7)."""
-        height_m, H = equations.height_of_point(self._state, k)
-        HP, S = equations.innovation_covariance(self._state, H, np.full((1, 1), variance_m2))
-        if (z_m - height_m) ** 2 <= gate * S[0, 0]:
-            equations.correct(self._state, HP, S, np.array([z_m - height_m]))
-
-    def correct_plane(self, plane: PlanarMotion) -> None:
-        """Update by the plane on which the vehicle stays: height and tilt."""
-        self.correct_height(0, plane.z_m, plane.z_sigma_m**2)
-        self.correct_up(UP, plane.tilt_sigma_rad, np.zeros((3, 3)))
-
-    def correct_depth(self, motion: Motion, z_m: float, variance_m2: float) -> None:
-        """Update by the height of the pressure port a motion after the state, (7)."""
-        position_m, H, H_m = (part[2:] for part in equations.position_of_body_point(self._state, motion, self.port))
-        HP, S = equations.innovation_covariance(self._state, H, H_m @ motion.C @ H_m.T + variance_m2)
-        equations.correct(self._state, HP, S, z_m - position_m)
-
-    def correct_heading(self, motion: Motion, yaw_rad: float, variance_rad2: float) -> None:
-        """Update by the yaw of the body and the compass' bias a motion after the state, (10)."""
-        predicted, H, H_m = equations.yaw_of_compass(self._state, motion)
-        e = np.array([wrap_angle(yaw_rad - predicted)])
-        self.correct_robustly(motion, H, H_m, e, np.array([[variance_rad2]]))
-
-    def correct_position(self, motion: Motion, point: Floats, position_m: Floats, cov_m2: Floats) -> None:
-        """Update by the position of a point of the body a motion after the state, (7)."""
-        predicted, H, H_m = equations.position_of_body_point(self._state, motion, point)
-        self.correct_robustly(motion, H, H_m, position_m - predicted, cov_m2)
-
-    def correct_robustly(self, motion: Motion, H: Floats, H_m: Floats, e: Floats, R_z: Floats) -> None:
-        """Update by measurements of which some are outliers, (9)."""
-        HP, S = equations.innovation_covariance(self._state, H, H_m @ motion.C @ H_m.T + R_z)
-        equations.correct(self._state, HP, doubted(e, S, R_z), e)
-
-    def observe(
-        self, motion: Motion, slot: int, z: Floats, R_z: Floats, *, may_be_far: bool
-    ) -> tuple[int, Floats, Floats]:
-        """Update by range and azimuth of a known landmark, (5), or the point seen where it may be far away, (6)."""
-        state, k = self._state, 1 + slot
-        if may_be_far:
-            x, G, G_m, G_z = equations.location(state, motion, self.sonar, z, 0.0)
-            # Exp(theta) turns both points: what is missed is xi_k - xi_new, without theta however far they are apart
-            missed, H = x - state.points[k], -G
-            H[:, equations.place_of(k)] += EYE
-            HP, S = equations.innovation_covariance(state, H, G_m @ motion.C @ G_m.T)
-            view = far_view(missed, S, G_z, self.sonar, z, R_z, slot)
-            if view is not None:
-                outcome, S, e, S_view = view
-                if outcome != GATED:
-                    equations.correct(state, HP, S, missed)
-                return outcome, e, S_view
-        predicted, H, H_m = equations.observation(state, k, motion, self.sonar)
-        e = z - predicted
-        e[1] = wrap_angle(e[1])
-        HP, S = equations.innovation_covariance(state, H, H_m @ motion.C @ H_m.T + R_z)
-        outcome, widened = admit(e, S, R_z, self.sonar.gate, slot)
-        if outcome != GATED:
-            equations.correct(state, HP, S + widened, e)
-        return outcome, e, S
+    def observe_far(self, motion: Motion, slot: int, z: Floats, R_z: Floats) -> Judged | None:
+        """Update by a landmark that may be far from where it is predicted, (6)."""
+        return observe_far(self._state, 1 + slot, motion, self.sonar, z, R_z)
 
     def augment(self, motion: Motion, z: Floats, R_z: Floats) -> None:
-        """Append a landmark seen for the first time, (6), on a floor of known height within the floor's gate."""
-        elevation_rad = self.sonar.elevation_of_new(*equations.pose(self._state, motion), z)
-        x, G, G_m, G_z = equations.location(self._state, motion, self.sonar, z, elevation_rad)
-        view = polar_covariance(R_z, self.sonar.aperture_rad)
-        self._state = equations.augmented(self._state, x, G, G_m @ motion.C @ G_m.T + G_z @ view @ G_z.T)
-        self.correct_height(len(self._state.points) - 1, self.sonar.floor_z_m, self.sonar.floor_variance_m2, FLOOR_GATE)
+        """Append a landmark, (6)."""
+        self._state = augment(self._state, motion, self.sonar, z, R_z)
+
+    def update_depth(self, motion: Motion, z_m: float, variance_m2: float) -> None:
+        """Update by the height of the pressure port, (7)."""
+        update_depth(self._state, motion, self.port, z_m, variance_m2)
+
+    def update_heading(self, motion: Motion, yaw_rad: float, variance_rad2: float) -> float:
+        """Update by the yaw of the body and the compass' bias, (10)."""
+        bias_variance_rad2 = self.calibration.heading.bias_sigma_rad**2
+        return update_heading(self._state, motion, yaw_rad, variance_rad2, bias_variance_rad2)
+
+    def update_position(self, motion: Motion, position_m: Floats, cov_m2: Floats) -> float:
+        """Update by the position of the antenna, (7)."""
+        return update_position(self._state, motion, self.antenna, position_m, cov_m2)
+
+    def update_up(self, up: Floats, sigma_rad: float, i_R_j: Floats) -> None:
+        """Update by the direction of the world's up, (8)."""
+        # the accelerometers' bias is constant in the body, which turns from i to j
+        by_accel = 0.5 * (np.eye(3) + i_R_j.T) / self.calibration.gravity_m_s2
+        update_up(self._state, up, by_accel, sigma_rad)
+
+    def update_plane(self, plane: PlanarMotion) -> None:
+        """Update by the plane on which the vehicle stays, (7) and (8)."""
+        update_plane(self._state, plane)
+
+    def attitude(self) -> Floats:
+        """world_R_body of the state, shape (3, 3)."""
+        return self._state.R.copy()
+
+    def gyro_bias(self) -> Floats:
+        """Estimated gyro bias, shape (3,), rad/s."""
+        return gyro_bias_of(self._state.bias, self._state.R[2] if self._state.is_level else NO_UP)
 
     def pose_after(self, motion: Motion) -> tuple[Floats, Floats, Floats]:
-        """world_R_body (3, 3), position (3,), and covariance of [theta, rho] (6, 6) a motion after the state."""
-        return *equations.pose(self._state, motion), equations.pose_covariance(self._state, motion)
+        """world_R_body (3, 3), position (3,), and covariance of [theta, rho] (6, 6) a motion after the state.
+
+        The error of the state is there ``[R'^T theta; R'^T (xi_0 - [X']x theta)]``, to which ``D beta + eps`` is added.
+        """
+        R, X, D = pose_after(self._state, motion)
+        A = np.zeros((6, BARE))
+        A[:3, THETA] = R.T
+        A[3:, BODY] = R.T
+        A[3:, THETA] = -R.T @ cross_matrix(X)
+        A[:, BETA] = D
+        return R, X, symmetric(A @ self._state.P[:BARE, :BARE] @ A.T + motion.C)
 
     def landmark(self, slot: int) -> tuple[Floats, Floats]:
-        """Position, and covariance of its coordinates."""
-        return self._state.points[1 + slot], equations.landmark_covariance(self._state, 1 + slot)
+        """Position, and covariance of its coordinates, ``xi_k - [x_k]x theta``."""
+        at = self._state.points[1 + slot]
+        A = np.zeros((POINT, len(self._state.P)))
+        A[:, place_of(1 + slot)] = np.eye(3)
+        A[:, THETA] = -cross_matrix(at)
+        return at, symmetric(A @ self._state.P @ A.T)
 
 
 def start_state(calibration: Calibration) -> InvariantState:
@@ -190,12 +449,13 @@ def start_state(calibration: Calibration) -> InvariantState:
     Errors of the start, ``R = R^ Exp(delta)`` and ``X = X^ + d``, are ``theta = R^ delta``, ``xi_0 = d + [X^]x theta``.
     """
     start = calibration.start
-    R, X = start.pose().rotation().matrix(), np.array(start.position_m)
-    A, P = np.zeros((BARE, 6)), np.zeros((BARE, BARE))
-    A[THETA, :3], A[BODY, :3], A[BODY, 3:] = R, equations.hat(X) @ R, EYE
+    R = np.ascontiguousarray(start.pose().rotation().matrix())
+    X = np.array(start.position_m)
+    A = np.zeros((BARE, 6))
+    A[THETA, :3] = R
+    A[BODY, :3] = cross_matrix(X) @ R
+    A[BODY, 3:] = np.eye(3)
     P = A @ np.diag(np.square((*start.rpy_sigma_rad, *start.position_sigma_m))) @ A.T
     P[BETA, BETA] = np.diag(bias_sigmas(calibration)[0] ** 2)
     body_p_dvl = np.array(calibration.dvl.mounting.translation_m)
-    return InvariantState(
-        R, X[None].copy(), np.zeros(BIASES), equations.symmetric(P), body_p_dvl, calibration.use_gravity
-    )
+    return InvariantState(R, X[None].copy(), np.zeros(BIASES), symmetric(P), body_p_dvl, calibration.use_gravity)

@@ -8,21 +8,24 @@ identity.py    acceptance of a recogniser's identities, and the gate
 """
 
 # fmt: off
-from sonar_graph.models.aiding import HUBER_WIDTHS, Contradictions, doubted, up_and_derivative, yaw_and_derivative
+from sonar_graph.models.aiding import HUBER_WIDTHS, Contradictions, huber_scale, up_and_derivative, yaw_and_derivative
 from sonar_graph.models.biases import (
-    ACCEL, BIASES, COMPASS, HEADING, SCALE, TILT, bias_sigmas, by_biases, gyro_bias_of,
+    ACCEL, BIASES, COMPASS, HEADING, SCALE, TILT, bias_jacobian, bias_sigmas, by_biases, gyro_bias_of,
 )
 from sonar_graph.models.identity import ACCEPTED, MINIMUM_PROBABILITY, gate_threshold, identify
 from sonar_graph.models.kernels import GaussianKernel, Kernel, KernelParams, Robust, RobustKernel
 from sonar_graph.models.sonar import (
-    FLOOR_GATE, elevation_on_floor, locate, locate_jacobians, project, project_points, range_azimuth,
-    range_azimuth_jacobians, sonar_point, sonar_point_jacobian, view_points, wrap_angle,
+    FLOOR_GATE, Mount, body_point_jacobian, elevation_on_floor, floor_elevation, locate, locate_from_body,
+    locate_jacobians, project, project_points, range_azimuth, range_azimuth_jacobians, sonar_point,
+    sonar_point_jacobian, view_from_body, view_points, wrap_angle,
 )
 
 __all__ = [
     "ACCEL", "ACCEPTED", "BIASES", "COMPASS", "Contradictions", "FLOOR_GATE", "GaussianKernel", "HEADING",
-    "HUBER_WIDTHS", "Kernel", "KernelParams", "MINIMUM_PROBABILITY", "Robust", "RobustKernel", "SCALE", "TILT",
-    "bias_sigmas", "by_biases", "doubted", "elevation_on_floor", "gate_threshold", "gyro_bias_of", "identify",
-    "locate", "locate_jacobians", "project", "project_points", "range_azimuth", "range_azimuth_jacobians",
-    "sonar_point", "sonar_point_jacobian", "up_and_derivative", "view_points", "wrap_angle", "yaw_and_derivative",
+    "HUBER_WIDTHS", "Kernel", "KernelParams", "MINIMUM_PROBABILITY", "Mount", "Robust", "RobustKernel", "SCALE",
+    "TILT", "bias_jacobian", "bias_sigmas", "body_point_jacobian", "by_biases", "elevation_on_floor", "floor_elevation",
+    "gate_threshold", "gyro_bias_of", "huber_scale", "identify", "locate", "locate_from_body", "locate_jacobians",
+    "project", "project_points", "range_azimuth", "range_azimuth_jacobians", "sonar_point", "sonar_point_jacobian",
+    "up_and_derivative",
+    "view_from_body", "view_points", "wrap_angle", "yaw_and_derivative",
 ]

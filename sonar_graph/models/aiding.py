@@ -15,14 +15,16 @@ import numpy as np
 from sonar_graph.measurements import Floats
 from sonar_graph.numerics import cross_matrix
 
-HUBER_WIDTHS = {1: 1.345, 3: 1.628}
+HEADING_WIDTH, FIX_WIDTH = 1.345, 1.628
+HUBER_WIDTHS = {1: HEADING_WIDTH, 3: FIX_WIDTH}
 """k of a heading and of a fix: 95 % efficient for Gaussian noise of so many dimensions. The kernel is convex: a start
 that is far off finds its way, which a kernel that lets go of large errors does not promise."""
 
 
 def yaw_and_derivative(R: Floats) -> tuple[float, Floats]:
     """Yaw of a rotation, rad, and its derivative by a turn of the body, shape (3,)."""
-    (x, a, c), (y, b, d) = R[0].tolist(), R[1].tolist()
+    x, a, c = R[0, 0], R[0, 1], R[0, 2]
+    y, b, d = R[1, 0], R[1, 1], R[1, 2]
     level2 = x * x + y * y
     return math.atan2(y, x), np.array([0.0, (y * c - x * d) / level2, (x * b - y * a) / level2])
 
@@ -33,10 +35,10 @@ def up_and_derivative(R: Floats) -> tuple[Floats, Floats]:
     return up, cross_matrix(up)
 
 
-def doubted(e: Floats, S: Floats, R: Floats) -> Floats:
-    """Covariance of an innovation e with the kernel's noise, where it is S with Gaussian noise R, shapes (m, m)."""
-    distance = math.sqrt(e @ np.linalg.solve(S, e))
-    return np.asarray(S + (max(1.0, distance / HUBER_WIDTHS[len(e)]) - 1.0) * R)
+def huber_scale(e: Floats, S: Floats) -> float:
+    """Factor ``max(1, d / k)`` by which Huber's kernel widens the noise of an innovation e of covariance S."""
+    k = HEADING_WIDTH if len(e) == 1 else FIX_WIDTH
+    return max(1.0, math.sqrt(e @ np.linalg.inv(S) @ e) / k)
 
 
 CONTRADICTING_SIGMAS = 5.0

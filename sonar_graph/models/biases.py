@@ -13,6 +13,7 @@ import numpy as np
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Floats
+from sonar_graph.numerics import compiled
 
 TILT, HEADING, ACCEL, COMPASS, SCALE, BIASES = slice(0, 3), slice(3, 6), slice(6, 9), 9, 10, 11
 """Places in b of the gyros' bias (rad/s), twice, that of the accelerometers (m/s²) and of the compass (rad), and the
@@ -30,12 +31,19 @@ def bias_sigmas(calibration: Calibration) -> tuple[Floats, Floats]:
     return sigmas, np.where(sigmas > 0, walks, 0.0)
 
 
+@compiled
 def gyro_bias_of(b: Floats, up: Floats) -> Floats:
     """Gyro bias in body axes, shape (3,), where the world's up lies along ``up`` in the body; zero without gravity."""
-    return np.asarray(b[TILT] + up * (up @ (b[HEADING] - b[TILT])))
+    return b[TILT] + up * np.sum(up * (b[HEADING] - b[TILT]))
 
 
 def by_biases(D: Floats, dR: Floats, dp: Floats, up: Floats, vertical: Floats, body_p_dvl: Floats) -> Floats:
+    """`bias_jacobian` of arrays in any memory layout."""
+    return bias_jacobian(*(np.ascontiguousarray(part) for part in (D, dR, dp, up, vertical, body_p_dvl)))
+
+
+@compiled
+def bias_jacobian(D: Floats, dR: Floats, dp: Floats, up: Floats, vertical: Floats, body_p_dvl: Floats) -> Floats:
     """Derivative of a motion's [theta, rho] by b, shape (6, 11), from that by the gyro bias, ``D``, shape (6, 3).
 
     By b_heading the body turns about the world's vertical alone, whatever its tilt meanwhile: ``u_j u_j^T D_theta``,
@@ -51,9 +59,12 @@ def by_biases(D: Floats, dR: Floats, dp: Floats, up: Floats, vertical: Floats, b
     vertical
         The same, with or without gravity.
     """
-    D_b, up_j, vertical_j = np.zeros((6, BIASES)), up @ dR, vertical @ dR
-    D_b[:3, HEADING], D_b[3:, HEADING] = np.outer(up_j, up_j @ D[:3]), np.outer(D[3:] @ up, up)
+    up_j = dR.T @ up
+    vertical_j = dR.T @ vertical
+    D_b = np.zeros((6, BIASES))
+    D_b[:3, HEADING] = np.outer(up_j, D[:3].T @ up_j)
+    D_b[3:, HEADING] = np.outer(D[3:] @ up, up)
     D_b[:, TILT] = D - D_b[:, HEADING]
-    way = (body_p_dvl - dp) @ dR - body_p_dvl
+    way = dR.T @ (body_p_dvl - dp) - body_p_dvl
     D_b[3:, SCALE] = way - vertical_j * (vertical_j @ way)
     return D_b

@@ -26,7 +26,7 @@ import gtsam
 import numpy as np
 
 from sonar_graph.measurements import Floats
-from sonar_graph.numerics import compiled
+from sonar_graph.numerics import compiled, cross_matrix
 
 FLOOR_GATE = 10.83
 """Gate for "the landmark stands on the floor": the 0.999 quantile of chi-square with one degree of freedom.
@@ -116,18 +116,62 @@ def range_azimuth(world_T_sonar: gtsam.Pose3, p_world: Floats) -> Floats:
 def range_azimuth_jacobians(
     world_T_body: gtsam.Pose3, body_T_sonar: gtsam.Pose3, p_world: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Range and azimuth with derivatives.
+    """Range and azimuth with derivatives, as `view_from_body`."""
+    R, X = _as_arrays(world_T_body)
+    return view_from_body(R, X, Mount(*_as_arrays(body_T_sonar)), np.ascontiguousarray(p_world))
 
-    Returns
-    -------
-    (range m, azimuth rad), shape (2,); the derivative by the body pose's right perturbation [theta, rho], shape (2, 6);
-    the derivative by the landmark, shape (2, 3).
+
+def _as_arrays(pose: gtsam.Pose3) -> tuple[Floats, Floats]:
+    return np.ascontiguousarray(pose.rotation().matrix()), pose.translation()
+
+
+class Mount(NamedTuple):
+    """Sonar in the body, as arrays."""
+
+    body_R_sonar: Floats
+    body_p_sonar: Floats
+
+
+@compiled
+def body_point_jacobian(R: Floats, q: Floats) -> Floats:
+    """``R [-[q]x  I]``, shape (3, 6): a point q of the body moves so in the world by [theta, rho] of its pose."""
+    J = np.empty((3, 6))
+    J[:, :3] = -R @ cross_matrix(q)
+    J[:, 3:] = R
+    return J
+
+
+@compiled
+def view_from_body(R: Floats, X: Floats, mount: Mount, p: Floats) -> tuple[Floats, Floats, Floats]:
+    """Range and azimuth, shape (2,), of a point p of the world from a body at ``world_T_body = (R, X)``.
+
+    Returns as well their derivative by the right perturbation [theta, rho] of the body's pose, shape (2, 6), and by the
+    point, shape (2, 3).
     """
-    view = view_points(world_T_body.compose(body_T_sonar), p_world[None])
-    by_body = view.by_sonar[0] @ body_T_sonar.inverse().AdjointMap()
-    return view.z[0], by_body, view.by_point[0]
+    q = R.T @ (p - X)  # in body axes
+    z, D_q = project(mount.body_R_sonar.T @ (q - mount.body_p_sonar))
+    N = D_q @ mount.body_R_sonar.T  # derivative by q, which moves by -[-[q]x  I] [theta; rho]
+    by_body = np.empty((2, 6))
+    by_body[:, :3] = N @ cross_matrix(q)
+    by_body[:, 3:] = -N
+    return z, by_body, N @ R.T
 
 
+@compiled
+def locate_from_body(
+    R: Floats, X: Floats, mount: Mount, z: Floats, elevation_rad: float
+) -> tuple[Floats, Floats, Floats]:
+    """The point of the world, shape (3,), at range and azimuth z and an elevation from a body at (R, X).
+
+    Returns as well its derivative by the right perturbation [theta, rho] of the body's pose, shape (3, 6), and by
+    (range, azimuth, elevation), shape (3, 3).
+    """
+    q = mount.body_p_sonar + mount.body_R_sonar @ sonar_point(z[0], z[1], elevation_rad)  # in body axes
+    by_polar = R @ mount.body_R_sonar @ sonar_point_jacobian(z[0], z[1], elevation_rad)
+    return X + R @ q, body_point_jacobian(R, q), by_polar
+
+
+@compiled
 def sonar_point(range_m: float, azimuth_rad: float, elevation_rad: float) -> Floats:
     """The point in the sonar frame with these spherical coordinates, shape (3,), m."""
     level_m = range_m * math.cos(elevation_rad)
@@ -136,6 +180,7 @@ def sonar_point(range_m: float, azimuth_rad: float, elevation_rad: float) -> Flo
     return np.array([x, y, range_m * math.sin(elevation_rad)])
 
 
+@compiled
 def sonar_point_jacobian(range_m: float, azimuth_rad: float, elevation_rad: float) -> Floats:
     """Derivative of `sonar_point` by (range, azimuth, elevation), shape (3, 3)."""
     ca = math.cos(azimuth_rad)
@@ -160,19 +205,9 @@ def locate(world_T_sonar: gtsam.Pose3, range_m: float, azimuth_rad: float, eleva
 def locate_jacobians(
     world_T_body: gtsam.Pose3, body_T_sonar: gtsam.Pose3, range_m: float, azimuth_rad: float, elevation_rad: float
 ) -> tuple[Floats, Floats, Floats]:
-    """A located point with derivatives.
-
-    Returns
-    -------
-    The point, shape (3,), m; its derivative by the body pose's right perturbation [theta, rho], shape (3, 6); its
-    derivative by (range, azimuth, elevation), shape (3, 3).
-    """
-    world_T_sonar = world_T_body.compose(body_T_sonar)
-    point = locate(world_T_sonar, range_m, azimuth_rad, elevation_rad)
-    p_body = np.asarray(world_T_body.transformTo(point), dtype=np.float64)
-    by_pose = world_T_body.rotation().matrix() @ np.hstack([-gtsam.SO3.Hat(p_body), np.eye(3)])
-    by_polar = world_T_sonar.rotation().matrix() @ sonar_point_jacobian(range_m, azimuth_rad, elevation_rad)
-    return point, by_pose, by_polar
+    """A located point with derivatives, as `locate_from_body`."""
+    R, X = _as_arrays(world_T_body)
+    return locate_from_body(R, X, Mount(*_as_arrays(body_T_sonar)), np.array([range_m, azimuth_rad]), elevation_rad)
 
 
 def elevation_on_floor(
@@ -187,14 +222,29 @@ def elevation_on_floor(
     which is ``A cos(e - e0) = height / range``: of its two solutions the one nearer to the centre beam. None where the
     floor, at a height ``floor_z_m`` in the world, is not within the full vertical aperture.
     """
-    a, b, c = world_T_sonar.rotation().matrix()[2].tolist()
-    level = a * math.cos(azimuth_rad) + b * math.sin(azimuth_rad)
-    reach_m = range_m * math.hypot(level, c)
-    height_m = floor_z_m - world_T_sonar.z()
+    up = np.ascontiguousarray(world_T_sonar.rotation().matrix()[2])
+    elevation_rad = floor_elevation(up, floor_z_m - world_T_sonar.z(), range_m, azimuth_rad)
+    return elevation_rad if abs(elevation_rad) <= 0.5 * aperture_rad else None
+
+
+@compiled
+def floor_elevation(up: Floats, height_m: float, range_m: float, azimuth_rad: float) -> float:
+    """Elevation (rad) of `elevation_on_floor` in any aperture; NaN where the floor is out of reach.
+
+    Parameters
+    ----------
+    up
+        Last row (a, b, c) of world_R_sonar, shape (3,).
+    height_m
+        Height of the floor above the sonar.
+    """
+    level = up[0] * math.cos(azimuth_rad) + up[1] * math.sin(azimuth_rad)
+    reach_m = range_m * math.hypot(level, up[2])
     is_reached = reach_m > 0.0 and abs(height_m) <= reach_m  # False for a NaN height: the floor is not known
     if not is_reached:
-        return None
-    middle = math.atan2(c, level)
+        return math.nan
+    middle = math.atan2(up[2], level)
     half = math.acos(height_m / reach_m)
-    nearest = min(wrap_angle(middle + half), wrap_angle(middle - half), key=abs)
-    return nearest if abs(nearest) <= 0.5 * aperture_rad else None
+    one = wrap_angle(middle + half)
+    other = wrap_angle(middle - half)
+    return one if abs(one) <= abs(other) else other

@@ -10,19 +10,26 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from baselines.ekf_slam import EkfSlam
-from baselines.event_order import DEPTH, END, EPOCH, GRAVITY, NO_VIEWS, Events, Motion
+from baselines.events import Motion
 from baselines.filter import FilterShell
-from baselines.invariant_ekf import InvariantEkf
-from baselines.invariant_equations import InvariantState
-from sonar_graph.calibration import Calibration, DepthCalibration, Mounting, SonarCalibration
-from sonar_graph.measurements import NS_PER_S, Floats
+from baselines.invariant_ekf import InvariantEkf, InvariantState
+from sonar_graph.calibration import (
+    Calibration,
+    DepthCalibration,
+    Mounting,
+    PositionCalibration,
+    SonarCalibration,
+)
+from sonar_graph.measurements import Floats
 from sonar_graph.navigation import Odometry
 
 SONAR = Mounting(translation_m=(0.4, 0.1, -0.2), rpy_rad=(0.1, 0.5, -0.2))
 PORT = np.array([0.1, 0.2, -0.3])
+ANTENNA = -2.0 * PORT
 CALIBRATION = Calibration(
     sonar=SonarCalibration(mounting=SONAR, range_sigma_m=0.02, azimuth_sigma_rad=0.01),
     depth=DepthCalibration(port_m=tuple(PORT)),
+    positions=PositionCalibration(antenna_m=tuple(ANTENNA)),
 )
 NOISE = np.diag([0.02**2, 0.01**2])
 BODY_M, LANDMARKS = np.array([1.0, -2.0, 0.5]), np.array([[4.0, -1.0, -1.7], [-2.0, 6.0, -2.5]])
@@ -99,29 +106,6 @@ def carried(world: World, motion: Motion, eps: Floats = NOTHING) -> World:
     return world._replace(R=pose.rotation().matrix(), X=pose.translation())
 
 
-def one_event(kind: int, motion: Motion, duration_s: float, numbers: Any = (0.0, 0.0)) -> Events:
-    """An event at the end of a motion without bias and Earth's rate, and the end of the call.
-
-    ``numbers``: height and its variance, or those of an interval of gravity.
-    """
-    stamps = np.array([[0, 0], [0, 0], [round(duration_s * NS_PER_S)] * 2, [kind, END], [0, 0]], np.int64)
-    motions, values = [np.array([part, part]) for part in motion], np.array([numbers], float)
-    return Events(*stamps, *motions, np.zeros(2, bool), *values.T[:2].copy(), values, *NO_VIEWS)
-
-
-def predict(slam: FilterShell, motion: Motion, duration_s: float = 1.0) -> None:
-    assert slam.advance(one_event(EPOCH, motion, duration_s), 0) == 1
-
-
-def correct_depth(slam: FilterShell, motion: Motion, z_m: float, variance_m2: float) -> None:
-    assert slam.advance(one_event(DEPTH, motion, 1.0, (z_m, variance_m2)), 0) == 1
-
-
-def correct_up(slam: FilterShell, up: Floats, sigma: float) -> None:
-    slam.impulse[:] = 9.8 * up
-    assert slam.advance(one_event(GRAVITY, STILL, 0.0, (*np.zeros(6), 1.0, sigma)), 0) == 1
-
-
 def random_covariance(n: int, scale: float = 0.03, seed: int = 0) -> Floats:
     """One that correlates everything."""
     A = scale * np.random.default_rng(seed).normal(size=(n, n))
@@ -170,7 +154,8 @@ class Invariant:
 
     @staticmethod
     def state(world: World, P: Floats) -> InvariantState:
-        return InvariantState(world.R.copy(), np.vstack([world.X, world.landmarks]), world.bias.copy(), P.copy())
+        points = np.vstack([world.X, world.landmarks])
+        return InvariantState(world.R.copy(), points, world.bias.copy(), P.copy(), np.zeros(3), is_level=True)
 
     @staticmethod
     def estimate(slam: Any) -> tuple[World, Floats]:

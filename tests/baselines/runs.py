@@ -99,7 +99,7 @@ def estimate_after(kind, calibration, seconds, *rows):
 
 def state_of(slam):
     """Arrays of the state at the newest node."""
-    return slam.state()[1:] if isinstance(slam, EkfSlam) else tuple(vars(slam.state()[1]).values())
+    return slam.state()[1:] if isinstance(slam, EkfSlam) else tuple(slam.state()[1])
 
 
 def height_and_tilt(slam):

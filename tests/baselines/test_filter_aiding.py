@@ -61,7 +61,7 @@ def test_aiding_in_a_gap_shares_the_error_of_the_motion(kind):
 def test_a_late_fix_has_the_motion_backwards_with_its_covariance_and_derivative(monkeypatch):
     """By differences of the inverse; it is asked for with the attitude at its start, that of the fix."""
     told, (gyro, doppler), nothing = [], circle(), np.zeros(6)
-    monkeypatch.setattr(EkfSlam, "_fix", lambda _, motion, *__: told.append(motion))
+    monkeypatch.setattr(EkfSlam, "update_position", lambda _, motion, *__: told.append(motion) or 0.0)
     slam, end_ns, fix_ns = begun(EkfSlam, circle_calibration()), later(10.0), later(6.03)
     slam.process(Measurements(end_ns, gyro.between(T0_NS - 1, end_ns), doppler.between(T0_NS - 1, end_ns)))
     late = PositionFixes(np.array([fix_ns]), np.zeros((1, 3)), np.eye(3)[None])

@@ -7,15 +7,15 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from baselines import ekf_equations, invariant_equations
-from baselines.sonar_update import USED, Gate, SonarModel, correction
+from baselines import ekf_slam, invariant_ekf
+from baselines.kalman import USED, correction
 from sonar_graph.calibration import DepthCalibration, PlanarMotion, Start
 from sonar_graph.models import locate, range_azimuth
 from sonar_graph.navigation import Odometry
-from sonar_graph.testing import check_derivative
 from sonar_graph.testing.numerical import central_differences
 
 from .filters import (
+    ANTENNA,
     CALIBRATION,
     LANDMARKS,
     NOISE,
@@ -28,11 +28,8 @@ from .filters import (
     begun,
     both,
     carried,
-    correct_depth,
-    correct_up,
     motion_of,
     pose_after,
-    predict,
     random_covariance,
     rotation,
     sonar_after,
@@ -76,7 +73,7 @@ def test_prediction_has_the_numerical_covariance_of_state_and_motion(filter_, an
     expected, slam = carried(world, motion), begun(filter_, world)
     F, J = numerical(lambda true, eps: filter_.error(carried(true, motion, eps), expected), filter_, world)
     _, P = filter_.estimate(slam)
-    predict(slam, motion, 0.0)
+    slam.predict(motion, 0.0)
     after, covariance = filter_.estimate(slam)
     assert_allclose(filter_.error(after, expected), 0.0, atol=1e-12)
     assert_covariance(covariance, F @ P @ F.T + J @ C @ J.T)
@@ -118,7 +115,7 @@ def test_updates_by_detection_depth_heading_and_fix_are_the_textbook_s(filter_, 
     H, H_m = numerical(
         lambda true, eps: range_azimuth(sonar_after(true, motion, eps), true.landmarks[1]), filter_, world, [1]
     )
-    outcome, innovation, S = slam.observe(motion, 1, view[:2] + e, R_z, may_be_far=False)
+    outcome, innovation, S = slam.observe(motion, 1, view[:2] + e, R_z)
     assert outcome == USED
     assert_allclose(innovation, e, atol=1e-9)
     assert_covariance(S, H @ P @ H.T + H_m @ C @ H_m.T + R_z)
@@ -127,20 +124,20 @@ def test_updates_by_detection_depth_heading_and_fix_are_the_textbook_s(filter_, 
     slam = begun(filter_, world)
     height = lambda true, eps: pose_after(true, motion, eps).transformFrom(PORT)[2:]  # noqa: E731
     H, H_m = numerical(height, filter_, world)
-    correct_depth(slam, motion, height(world, NOTHING)[0] + 0.02, 3e-4)
+    slam.update_depth(motion, height(world, NOTHING)[0] + 0.02, 3e-4)
     assert_corrected(filter_, slam, world, P, H, H_m @ C @ H_m.T + 3e-4, np.array([0.02]))
 
     assume(abs(pose_after(world, motion).rotation().pitch()) < 1.4)
     compass = lambda true, eps: np.array([pose_after(true, motion, eps).rotation().yaw() + true.bias[9]])  # noqa: E731
     H, H_m = numerical(compass, filter_, world, [0])
     slam, e = begun(filter_, world), np.array([-0.01])
-    slam.correct_heading(motion, compass(world, NOTHING)[0] + e[0] - 2 * np.pi, 3e-4)
+    slam.update_heading(motion, compass(world, NOTHING)[0] + e[0] - 2 * np.pi, 3e-4)
     assert_corrected(filter_, slam, world, P, H, H_m @ C @ H_m.T + 3e-4, e)
 
-    antenna = lambda true, eps: pose_after(true, motion, eps).transformFrom(-2.0 * PORT)  # noqa: E731
+    antenna = lambda true, eps: pose_after(true, motion, eps).transformFrom(ANTENNA)  # noqa: E731
     H, H_m = numerical(antenna, filter_, world)
     slam, e, R_z = begun(filter_, world), np.array([0.01, -0.02, 0.03]), random_covariance(3, 0.05) + 1e-3 * np.eye(3)
-    slam.correct_position(motion, -2.0 * PORT, antenna(world, NOTHING) + e, R_z)
+    slam.update_position(motion, antenna(world, NOTHING) + e, R_z)
     assert_corrected(filter_, slam, world, P, H, H_m @ C @ H_m.T + R_z, e)
 
 
@@ -149,11 +146,11 @@ def test_an_outlying_fix_has_the_kernel_s_noise(filter_):
     """Ten standard deviations S off, ``R`` is ``10 / 1.628 R``; 1.6 off it is R; k of a heading is 1.345."""
     world, R_z = world_at(ANGLES), np.diag([0.04, 0.09, 0.25])
     _, P = filter_.estimate(begun(filter_, world))
-    H, _ = numerical(lambda true, eps: pose_after(true, STILL, eps).translation(), filter_, world)
+    H, _ = numerical(lambda true, eps: pose_after(true, STILL, eps).transformFrom(ANTENNA), filter_, world)
     for deviations, times in ((1.6, 1.0), (10.0, 10.0 / 1.628)):
         slam, e = begun(filter_, world), np.zeros(3)
         e[0] = deviations / np.sqrt(np.linalg.inv(H @ P @ H.T + R_z)[0, 0])
-        slam.correct_position(STILL, np.zeros(3), world.X + e, R_z)
+        slam.update_position(STILL, pose_after(world, STILL).transformFrom(ANTENNA) + e, R_z)
         assert_corrected(filter_, slam, world, P, H, times * R_z, e)
     H, _ = numerical(
         lambda true, eps: np.array([pose_after(true, STILL, eps).rotation().yaw() + true.bias[9]]), filter_, world, [0]
@@ -162,7 +159,7 @@ def test_an_outlying_fix_has_the_kernel_s_noise(filter_):
     for deviations, times in ((1.3, 1.0), (5.0, 5.0 / 1.345)):
         slam, e = begun(filter_, world), np.array([deviations * np.sqrt(S)])
         yaw = pose_after(world, STILL).rotation().yaw() + world.bias[9]
-        slam.correct_heading(STILL, yaw + e[0], 1e-4)
+        slam.update_heading(STILL, yaw + e[0], 1e-4)
         assert_corrected(filter_, slam, world, P, H, times * np.array([[1e-4]]), e)
 
 
@@ -202,15 +199,15 @@ def test_depth_up_and_plane_are_scalar_kalman_updates_where_nothing_correlates(f
         return gtsam.Rot3(R).rpy(), X, np.diag(cov)
 
     noisy = still._replace(C=0.02 * np.eye(6))
-    _, X, variances = after(lambda slam: correct_depth(slam, noisy, 0.01, 0.03))
+    _, X, variances = after(lambda slam: slam.update_depth(noisy, 0.01, 0.03))
     assert variances[5] == pytest.approx(1 / (1 / z + 1 / 0.05))
     assert X[2] == pytest.approx(0.01 * z / (z + 0.05))
     # the body's y axis points up by a milliradian: roll
-    rpy, _, variances = after(lambda slam: correct_up(slam, np.array([0.0, 0.001, 1.0]), np.sqrt(0.05)))
+    rpy, _, variances = after(lambda slam: slam.update_up(np.array([0.0, 0.001, 1.0]), np.sqrt(0.05), np.eye(3)))
     assert_allclose(variances[:2], [1 / (1 / roll + 20), 1 / (1 / pitch + 20)], rtol=1e-5)
     assert rpy[0] == pytest.approx(0.001 * roll / (roll + 0.05), rel=1e-3)
     plane = PlanarMotion(z_m=0.02, z_sigma_m=np.sqrt(0.05), tilt_sigma_rad=0.1)
-    _, X, variances = after(lambda slam: slam.correct_plane(plane))
+    _, X, variances = after(lambda slam: slam.update_plane(plane))
     assert_allclose(variances[[0, 1, 5]], [1 / (1 / roll + 100), 1 / (1 / pitch + 100), 1 / (1 / z + 20)], rtol=1e-3)
     assert X[2] == pytest.approx(0.02 * z / (z + 0.05))
 
@@ -219,9 +216,8 @@ def test_depth_up_and_plane_are_scalar_kalman_updates_where_nothing_correlates(f
 
 
 def test_a_correction_keeps_roll_and_yaw_within_half_a_turn():
-    x, P = np.array([0.0, 0.0, 0.0, 3.1, 0.0, -3.1]), np.eye(6)
-    ekf_equations.correct_number(x, P, 3, 3.3 - 2 * np.pi, 1.0)
-    ekf_equations.correct_number(x, P, 5, -3.3 + 2 * np.pi, 1.0)
+    x, P = np.array([0.0, 0.0, 0.0, 3.1, 0.0, -3.1, 0.0]), np.eye(7)
+    ekf_slam.update(x, P, np.eye(7)[[3, 5]], np.array([0.2, -0.2]), np.eye(2))
     assert x[[3, 5]] == pytest.approx([3.2 - 2 * np.pi, -3.2 + 2 * np.pi])
 
 
@@ -230,7 +226,7 @@ def test_roll_has_the_variance_of_the_tilt_over_the_squared_cosine_of_the_pitch(
     up = np.array([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)])
     x, P = np.array([1.0, 2.0, 0.7, 0.05, -0.88, 0.3]), np.diag(prior)
     before, R = x.copy(), np.array([(sigma / np.cos(pitch)) ** 2, sigma**2])
-    ekf_equations.correct_up(x, P, up, sigma)
+    ekf_slam.update_up(x, P, up, sigma)
     gain = prior[3:5] / (prior[3:5] + R)
     assert_allclose(x[3:5], before[3:5] + gain * ([roll, pitch] - before[3:5]), atol=1e-12)
     assert_allclose(np.diag(P), [*prior[:3], *((1 - gain) * prior[3:5]), prior[5]], atol=1e-15)
@@ -241,61 +237,66 @@ def test_roll_has_the_variance_of_the_tilt_over_the_squared_cosine_of_the_pitch(
 
 @given(attitudes, st.one_of(triples(*[st.floats(-1.7, 1.7)] * 3), attitudes))
 def test_an_error_moves_the_estimate_by_the_group_s_exponential(angles, turn):
+    """A measurement of the whole error without noise."""
     world, xi = world_at(angles), np.concatenate([turn, np.linspace(-0.2, 0.4, 20)])
     expected, state = Invariant.moved(world, xi), Invariant.state(world, np.eye(23))
-    invariant_equations.retract(state, xi)
+    invariant_ekf.update(state, np.eye(23), xi, 1e-15 * np.eye(23))
     assert_allclose(state.R, expected.R, atol=1e-12)
     assert_allclose(state.points, np.vstack([expected.X, expected.landmarks]), atol=1e-11)
-    assert_allclose(state.bias, expected.bias, atol=1e-15)
+    assert_allclose(state.bias, expected.bias, atol=1e-14)
 
 
-@given(attitudes, twists, views, st.floats(-np.pi, np.pi))
-def test_every_jacobian_is_the_numerical_one(angles, twist, view, turn):
-    """Of view, point seen, position, heading, height and up: by xi and motion. The direction of up is the true one."""
-    motion = motion_of(twist, C)
-    world, sonar = in_view(angles, motion, view), SonarModel.of(CALIBRATION, Gate.of(1.0, 0.0))
-    state = Invariant.state(world, np.eye(23))
+@given(attitudes)
+def test_the_direction_of_up_has_the_numerical_derivative_and_updates_as_the_textbook_s(angles):
+    """With the bias of the accelerometers, by half a turn between both ends."""
+    world, i_R_j, e = world_at(angles), rotation(np.array([0.1, -0.2, 0.5])), np.array([0.01, -0.02])
+    A = 0.5 * (np.eye(3) + i_R_j.T) / CALIBRATION.gravity_m_s2
+    slam = begun(Invariant, world)
+    _, P = Invariant.estimate(slam)
 
-    def check(H, H_m, function, angles=()):
-        check_derivative(lambda xi: function(Invariant.moved(world, xi), NOTHING), H, INVARIANT_XI, angles=angles)
-        check_derivative(lambda eps: function(world, eps), H_m, NOTHING, angles=angles)
+    def missed(true, _):
+        """Horizontal part of the true direction, as the estimate turns it into the world."""
+        return (world.R @ (true.R.T @ UP + A @ (true.bias[6:9] - world.bias[6:9])))[:2]
 
-    def sight(true, eps):
-        return range_azimuth(sonar_after(true, motion, eps), true.landmarks[1])
+    H, _ = numerical(missed, Invariant, world)
+    up = world.R.T @ np.array([*e, 1.0]) + A @ world.bias[6:9]
+    slam.update_up(up, 0.03, i_R_j)
+    assert_corrected(Invariant, slam, world, P, H, 0.03**2 * np.eye(2), e)
 
-    def located(true, eps, off=np.zeros(3)):  # noqa: B008
-        seen = true._replace(landmarks=locate(sonar_after(true, motion, eps), *(view + off))[None])
-        return Invariant.error(seen, world._replace(landmarks=world.landmarks[1:]))[-3:]
 
-    z, H, H_m = invariant_equations.observation(state, 2, motion, sonar)
-    assert_allclose(z[0], view[0], atol=1e-9)
-    check(H, H_m, sight, [1])
-    x, G, G_m, G_z = invariant_equations.location(state, motion, sonar, view[:2], view[2])
-    assert_allclose(x, world.landmarks[1], atol=1e-12)
-    check(G, G_m, located)
-    check_derivative(lambda off: located(world, NOTHING, off), G_z, np.zeros(3))
-    _, H, H_m = invariant_equations.position_of_body_point(state, motion, PORT)
-    check(H, H_m, lambda true, eps: pose_after(true, motion, eps).transformFrom(PORT))
-    assume(abs(pose_after(world, motion).rotation().pitch()) < 1.4)
-    _, H, H_m = invariant_equations.yaw_of_compass(state, motion)
-    check(H, H_m, lambda true, eps: [pose_after(true, motion, eps).rotation().yaw() + true.bias[9]], [0])
-    for k in range(3):
-        _, H = invariant_equations.height_of_point(state, k)
-        check(H, np.zeros((1, 6)), lambda true, _, k=k: np.vstack([true.X, true.landmarks])[k, 2:])
-    A = random_covariance(3, 0.3)
-    _, H = invariant_equations.up_innovation(state, np.array([np.cos(turn), np.sin(turn), 0.3]), A)
+@both
+@given(attitudes, twists, views)
+def test_an_update_by_a_point_seen_far_off_is_the_textbook_s(filter_, angles, twist, view):
+    """By ``0 = g(x_v, z) - p``, which is compared where range and azimuth are not linear enough; turns cancel in it."""
+    motion, R_z, e = motion_of(twist, C), 1e-6 * np.eye(2), np.array([0.02, -0.01, 0.03])
+    view = view * [1.0, 1.0, 0.0]
+    where = locate(sonar_after(world_at(angles), motion), *view)
+    world = world_at(angles, np.vstack([LANDMARKS[0], where - e]))
+    slam = begun(filter_, world, gate=1.0)
+    _, P = filter_.estimate(slam)
 
-    def tilt(true, _):
-        return invariant_equations.up_innovation(state, true.R.T @ UP + A @ true.bias[6:9], A)[0]
+    def seen(true, eps, off=np.zeros(3)):  # noqa: B008
+        point = locate(sonar_after(true, motion, eps), *(view + off))
+        return filter_.error(true._replace(landmarks=point[None]), world._replace(landmarks=where[None]))[-3:]
 
-    check(H, np.zeros((2, 6)), tilt)
+    def shift(true, eps):
+        turned = filter_.error(true, world)[-3:] if filter_ is Ekf else Invariant.error(true, world)[-3:]
+        return turned - seen(true, eps)
+
+    H, H_m = numerical(shift, filter_, world)
+    G_z = central_differences(lambda off: seen(world, NOTHING, off), np.zeros(3))
+    aperture = CALIBRATION.sonar.elevation_aperture_rad
+    V = np.diag([1e-6 + view[0] ** 2 * aperture**4 / 320.0, 1e-6, aperture**2 / 12.0])
+    judged = slam.observe_far(motion, 1, view[:2], R_z)
+    assume(judged is not None)
+    assert_corrected(filter_, slam, world, P, H, H_m @ C @ H_m.T + G_z @ V @ G_z.T, e)
 
 
 def test_the_bias_walks_where_there_is_one():
     slam, motion, duration_s = begun(Invariant, world_at(ANGLES)), motion_of(np.zeros(6), np.zeros((6, 6))), 4.0
     before = slam.state()[1].P
     walks = [CALIBRATION.imu.gyro_bias_walk_density] * 6 + [CALIBRATION.imu.accel_bias_walk_density] * 3 + [0.0] * 2
-    predict(slam, motion._replace(D=np.zeros((6, 3))), duration_s)
+    slam.predict(motion._replace(D=np.zeros((6, 3))), duration_s)
     walked = np.diag([0.0] * 3 + [density**2 * duration_s for density in walks] + [0.0] * 9)
     assert_allclose(slam.state()[1].P - before, walked, atol=1e-15)
 
@@ -306,9 +307,8 @@ def test_a_correction_by_many_numbers_is_joseph_s_and_exactly_symmetric(seed, m)
     rng, P, n = np.random.default_rng(seed), random_covariance(15, seed=seed), 15
     H, root, e = rng.normal(size=(m, n)), 0.1 * rng.normal(size=(m, m)), 0.01 * rng.normal(size=m)
     R = root @ root.T + 1e-3 * np.eye(m)
-    U, S = H @ P, H @ P @ H.T + R
-    after, K = P.copy(), U.T @ np.linalg.inv(S)
-    assert_allclose(correction(after, U, S, e), K @ e, atol=1e-12)
+    after, K = P.copy(), P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+    assert_allclose(correction(after, H, e, R), K @ e, atol=1e-12)
     assert_covariance(after, (np.eye(n) - K @ H) @ P @ (np.eye(n) - K @ H).T + K @ R @ K.T)
 
 
@@ -323,23 +323,21 @@ def gauge(axes):
 
 @given(attitudes, twists, views)
 def test_no_measurement_tells_where_the_world_is_or_which_way_it_is_turned(angles, twist, view):
-    """At any estimate, right or wrong: H N = 0 and F N = N with one and the same N. Height and tilt are told."""
+    """At any estimate, right or wrong: of ``P = N N^T`` prediction and updates leave all. Height and tilt are told."""
     motion = motion_of(twist, np.zeros((6, 6)))
-    world, sonar = in_view(angles, motion, view), SonarModel.of(CALIBRATION, Gate.of(1.0, 0.0))
-    state, known = Invariant.state(world, np.eye(23)), gauge(3) @ gauge(3).T
-    H = np.vstack(
-        [
-            invariant_equations.observation(state, 2, motion, sonar)[1],
-            invariant_equations.position_of_body_point(state, motion, PORT)[1][2:],
-            *(invariant_equations.height_of_point(state, k)[1] for k in range(3)),
-            invariant_equations.up_innovation(state, np.array([0.1, 0.2, 0.9]), np.eye(3) / 9.8)[1],
-        ]
-    )
-    assert_allclose(H @ gauge(2), 0.0, atol=1e-10)
-    assert np.linalg.norm(H @ gauge(3)[:, 2]) > 1.0
+    world, known = in_view(angles, motion, view), gauge(2) @ gauge(2).T
+    slam = begun(Invariant, world, known, gate=1.0)
+    slam.observe(motion, 1, view[:2] + 0.1, NOISE)
+    slam.update_depth(motion, 0.3, 1e-2)
+    slam.update_up(np.array([0.1, 0.2, 0.9]), 0.1, np.eye(3))
+    slam.update_plane(PlanarMotion())
+    assert_allclose(slam.state()[1].P, known, atol=1e-10)
+    slam.predict(motion, 0.0)
+    assert_allclose(slam.state()[1].P, known, atol=1e-10)
+    known = gauge(3) @ gauge(3).T
     slam = begun(Invariant, world, known)
-    predict(slam, motion, 0.0)
-    assert_allclose(slam.state()[1].P, known, atol=1e-12)
+    slam.update_depth(motion, 0.3, 1e-2)
+    assert np.abs(slam.state()[1].P - known).max() > 0.5
 
 
 # ---------------------------------------------------------------------------------------------- observability

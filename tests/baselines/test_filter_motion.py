@@ -11,9 +11,8 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from baselines.dead_reckoning import DeadReckoning
-from baselines.ekf_equations import COMPASS
-from baselines.ekf_slam import EkfSlam
-from baselines.event_order import Motion, remove_rate
+from baselines.ekf_slam import COMPASS, EkfSlam
+from baselines.events import Motion, remove_rate
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Start
 from sonar_graph.measurements import NS_PER_S, Measurements
 from sonar_graph.navigation import Odometry
@@ -159,9 +158,8 @@ def test_dead_reckoning_ignores_detections_and_says_so():
 
 
 def without(bias, earth, dR, dp, D, impulse):
-    found = dR.copy(), dp.copy(), impulse.copy()
-    remove_rate(*found[:2], D, found[2], bias, earth)
-    return found
+    reduced = remove_rate(Motion(dR, dp, np.eye(6), D, impulse), bias, earth)
+    return reduced.dR, reduced.dp, reduced.impulse
 
 
 def test_a_bias_and_the_earth_s_rate_are_removed_from_a_motion_as_from_its_rows(mission):

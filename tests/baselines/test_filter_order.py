@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from baselines.event_order import DEPTH, END, EPOCH, FIX, FRAME, GRAVITY, HEADING, PLANE, in_order
-from baselines.sonar_update import USED
+from baselines.events import DEPTH, END, EPOCH, FIX, FRAME, HEADING, Call, Order, Views, in_order
+from baselines.kalman import USED
 from sonar_graph.calibration import Calibration, FloorPrior, SonarCalibration
 from sonar_graph.errors import EstimatorError, MeasurementError
 from sonar_graph.measurements import NS_PER_S, Measurements
@@ -103,29 +103,18 @@ def test_each_detection_has_its_outcome_and_a_refused_one_changes_nothing(kind):
 
 
 @slam_filters
-def test_a_filter_that_refuses_what_most_detections_say_says_so_and_follows_them(kind):
-    """A landmark stands 0.5 m farther than first seen; however the log is cut, and not after one outlier."""
+@pytest.mark.parametrize("settings", [{"gate_probability": 0.999}, {"kernel_width": 1.5, "gate_probability": 0.999}])
+def test_a_filter_whose_gate_locks_right_detections_out_says_so(kind, settings):
+    """A landmark stands 0.5 m farther than first seen; not after one outlier, and not without gate and kernel."""
     t = np.concatenate([[0.5], np.arange(1.0, 9.0, 0.25)])
-    far_m, states = 2.0 + 0.5 * (t >= 3.0), []
-    for cuts in ((9.0,), (1.6, 4.1, 4.2, 9.0)):
-        slam, before_ns = begun(kind, Calibration(), gate_probability=0.999), T0_NS - 1
-        for end_ns in (later(cut) for cut in cuts):
-            rows = [block.between(before_ns, end_ns) for block in (imu(9), dvl(9), seen(later(*t), range_m=far_m))]
-            slam.process(Measurements(end_ns, rows[0], rows[1], None, rows[2]))
-            before_ns = end_ns
-        states.append(state_of(slam))
-    for part, same in zip(*states, strict=True):
-        assert_array_equal(part, same)
-    outcomes = slam.detections().outcomes
-    assert outcomes[9:14] == [Outcome.GATED] * 5
-    assert outcomes[14] is Outcome.LET_IN
-    assert outcomes[-1] is Outcome.USED
-    assert np.abs(slam.detections().innovations[-1, 0]) < 0.1
+    rows = "landmark", Calibration(), imu(9), dvl(9), None
+    slam = run(kind, Sequence(*rows, seen(later(*t), 2.0 + 0.5 * (t >= 3.0))), **settings)
+    assert slam.detections().outcomes.count(Outcome.GATED) == 24
     (message,) = slam.withheld()
-    assert f"first at {later(t[14]) * 1e-9:.3f} s" in message
-    assert "the gate may be the cause" in message
-    calm = run(kind, Sequence("one outlier", Calibration(), imu(9), dvl(9), None, seen(later(*t), 2.0 + (t == 4.0))))
-    assert calm.withheld() == []
+    assert message.startswith("24 of 32 detections of known landmarks lie outside the 99.9 % ellipse")
+    assert run(kind, Sequence(*rows, seen(later(*t), 2.0 + (t == 4.0))), **settings).withheld() == []
+    free = run(kind, Sequence(*rows, seen(later(*t), 2.0 + 0.5 * (t >= 3.0))), kernel_width=0.0)
+    assert free.withheld() == []
 
 
 @slam_filters
@@ -189,26 +178,24 @@ def test_the_outcome_depends_neither_on_how_the_log_is_cut_nor_on_being_asked(mi
 
 
 def test_events_come_in_the_order_of_their_stamps_each_with_its_motion_from_the_newest_epoch():
-    """At equal stamps epoch, plane, gravity, depth, heading, fix, frame; gravity where its interval is long enough."""
-    samples = np.array([[3, 10, 20, 20, 20, 50], [*[DEPTH] * 3, HEADING, FIX, DEPTH], [0, 1, 2, 0, 1, 3]])
-    seen = np.array([18, 20, 20, 45, 45])
+    """At equal stamps epoch, depth, heading, fix, frame; gravity where its interval is long enough."""
+    sample_ns, kinds = np.array([3, 10, 20, 20, 20, 50]), np.array([*[DEPTH] * 3, HEADING, FIX, DEPTH])
+    stamps_ns = np.array([18, 20, 20, 45, 45])
     outcome = np.array([*[ACCEPTED] * 3, USED, ACCEPTED], np.int8)
+    pairs, covs = np.zeros((5, 2)), np.zeros((5, 2, 2))
+    views = Views(stamps_ns, np.zeros(5, np.int64), pairs, covs, outcome, pairs, covs)
 
-    def events(interval_ns, is_planar=False):
-        epochs, reached, out = np.array([19, 39, 57]), np.array([20, 40, 58]), np.empty((5, 30), np.int64)
-        n = in_order(epochs, reached, samples, seen, outcome, 10, 60, 5, 5, interval_ns, is_planar, out)
-        return list(map(tuple, out[:, :n].T.tolist()))
+    def events(interval_ns):
+        call = Call(since_ns=10, end_ns=60, node_ns=5, opened_ns=5, interval_ns=interval_ns)
+        order = Order(*in_order(np.array([19, 39, 57]), np.array([20, 40, 58]), sample_ns, kinds, views, call))
+        return list(zip(*(column.tolist() for column in order), strict=True))
 
-    expected = [
-        (10, 5, 10, DEPTH, 1), (18, 5, 18, FRAME, 0), (20, 5, 19, EPOCH, 0), (20, 19, 20, DEPTH, 2),
-        (20, 19, 20, HEADING, 0), (20, 19, 20, FIX, 1),
-        (20, 19, 20, FRAME, 1), (40, 19, 39, EPOCH, 1), (40, 39, 39, GRAVITY, 0), (45, 39, 45, FRAME, 4),
-        (50, 39, 50, DEPTH, 3), (58, 39, 57, EPOCH, 2), (60, 57, 60, END, 0),
+    assert events(34) == [
+        (10, 5, 10, DEPTH, 1, 0), (18, 5, 18, FRAME, 0, 0), (20, 5, 19, EPOCH, 0, 0), (20, 19, 20, DEPTH, 2, 0),
+        (20, 19, 20, HEADING, 3, 0), (20, 19, 20, FIX, 4, 0), (20, 19, 20, FRAME, 1, 0), (40, 19, 39, EPOCH, 1, 1),
+        (45, 39, 45, FRAME, 4, 0), (50, 39, 50, DEPTH, 5, 0), (58, 39, 57, EPOCH, 2, 0), (60, 57, 60, END, 0, 0),
     ]  # fmt: skip
-    assert events(34) == expected
-    assert events(0) == [event for event in expected if event[3] != GRAVITY]
-    assert [event[3] for event in events(14, is_planar=True)[3:6]] == [PLANE, GRAVITY, DEPTH]
-    assert [event[3] for event in events(14)].count(GRAVITY) == 3
+    assert [sum(event[5] for event in events(interval_ns)) for interval_ns in (0, 14)] == [0, 3]
 
 
 @slam_filters

@@ -8,24 +8,16 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from baselines.sonar_update import (
-    GATED,
-    JUDGED_TOGETHER,
-    LET_IN,
-    OUTLYING,
-    USED,
-    Gate,
-    SonarModel,
-    admit,
-    far_view,
-    read,
-)
+from baselines.events import read_detections
+from baselines.filter import lockout_messages
+from baselines.kalman import GATED, USED, far_covariance, is_far, judged, judged_far
 from sonar_graph.calibration import FloorPrior, SonarCalibration
 from sonar_graph.measurements import NS_PER_S
 from sonar_graph.models import FLOOR_GATE, RobustKernel, elevation_on_floor, gate_threshold, locate, range_azimuth
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+from sonar_graph.states import DetectionLog, Outcome
 from sonar_graph.testing.numerical import central_differences
 
 from .filters import (
@@ -103,7 +95,7 @@ def test_a_new_landmark_has_the_covariance_of_many_draws(filter_):
 def test_an_innovation_has_the_covariance_of_many_draws(filter_):
     rng = np.random.default_rng(7)
     world, P, z = with_landmark(filter_)
-    outcome, e, S = begun(filter_, world, P).observe(MOTION, 0, z + np.array([0.01, -0.005]), NOISE, may_be_far=False)
+    outcome, e, S = begun(filter_, world, P).observe(MOTION, 0, z + np.array([0.01, -0.005]), NOISE)
     assert outcome == USED
     assert_allclose(e, [0.01, -0.005], atol=1e-9)
     views = []
@@ -163,7 +155,7 @@ def test_the_floor_s_gate_is_passed_by_999_of_1000_that_stand_on_it():
 def test_a_gated_detection_changes_nothing_and_has_its_innovation(filter_):
     world, P, z = with_landmark(filter_)
     slam = begun(filter_, world, P)
-    outcome, e, S = slam.observe(MOTION, 0, z + np.array([1.0, 0.0]), NOISE, may_be_far=False)
+    outcome, e, S = slam.observe(MOTION, 0, z + np.array([1.0, 0.0]), NOISE)
     assert outcome == GATED
     assert e[0] == pytest.approx(1.0)
     assert np.linalg.eigvalsh(S).min() > 0
@@ -176,7 +168,7 @@ def test_a_gated_detection_changes_nothing_and_has_its_innovation(filter_):
 def test_the_innovation_of_azimuth_wraps_around(filter_):
     world, P, _ = with_landmark(filter_, view=(3.0, math.pi - 0.004, 0.1))
     slam = begun(filter_, world, P)
-    outcome, e, _ = slam.observe(MOTION, 0, np.array([3.0, -math.pi + 0.004]), NOISE, may_be_far=False)
+    outcome, e, _ = slam.observe(MOTION, 0, np.array([3.0, -math.pi + 0.004]), NOISE)
     assert outcome == USED
     assert e[1] == pytest.approx(0.008, abs=1e-9)
 
@@ -185,12 +177,13 @@ def test_the_innovation_of_azimuth_wraps_around(filter_):
 def test_noise_is_the_log_s_made_symmetric_and_where_it_has_a_hole_the_calibration_s(hole):
     logged = np.array([[[4e-4, 3e-5], [1e-5, 1e-4]]] * 2)
     logged[(1, *hole)] = math.nan
-    assert_allclose(read(*np.ones((2, 2)), logged, NOISE)[1], [[[4e-4, 2e-5], [2e-5, 1e-4]], NOISE])
+    assert_allclose(read_detections(*np.ones((2, 2)), logged, NOISE)[1], [[[4e-4, 2e-5], [2e-5, 1e-4]], NOISE])
 
 
 # ---------------------------------------------------------------------------------------------- views from far away
 
 FAR_LANDMARK, APERTURE_RAD = np.array([25.0, 12.0, -1.0]), 0.3
+TURNED = Rotation.from_euler("xyz", [0.4, -0.7, 1.9]).as_matrix()
 AHEAD = CALIBRATION.model_copy(update={"sonar": SonarCalibration(elevation_aperture_rad=APERTURE_RAD)})
 """A sonar at the origin of the body."""
 
@@ -209,7 +202,9 @@ def look(filter_, X, position_sigma_m, may_be_far, wrong_m=0.0):
     P = T @ np.diag(np.repeat(np.square([position_sigma_m, 1e-3, 0.01]), 3)) @ T.T
     slam, q = begun(filter_, here, P, AHEAD), FAR_LANDMARK - X
     z = np.array([np.linalg.norm(q) + wrong_m, np.arctan2(q[1], q[0])])
-    outcome, e, S = slam.observe(STILL, 0, z, slam.sonar.R_z, may_be_far=may_be_far)
+    R_z = np.diag([AHEAD.sonar.range_sigma_m**2, AHEAD.sonar.azimuth_sigma_rad**2])
+    judged = slam.observe_far(STILL, 0, z, R_z) if may_be_far else None
+    outcome, e, S = judged or slam.observe(STILL, 0, z, R_z)
     _, at, covariance = slam.pose_after(STILL)
     return outcome, at, covariance[3:, 3:], e, S
 
@@ -243,59 +238,51 @@ def test_what_no_vehicle_in_reach_sees_is_refused(filter_):
     assert e @ np.linalg.solve(S, e) > gate_threshold(0.999, 2)
 
 
-def far(cov, G_z, range_m, noise, missed=(0.0, 0.0, 0.0), aperture_rad=APERTURE_RAD, kernel_width=0.0):
-    """`far_view` of a detection with this covariance of range and azimuth; None where it is linear enough."""
-    sonar = SonarModel.of(AHEAD, Gate.of(1.0, kernel_width))._replace(aperture_rad=aperture_rad)
-    return far_view(np.array(missed), np.array(cov), G_z, sonar, np.array([range_m, 0.0]), np.array(noise), 0)
+def far(cov, G_z, range_m, noise):
+    """True where a detection with this covariance of range and azimuth is compared with the point seen."""
+    return is_far(np.array(cov, float), np.array(G_z, float), range_m, np.array(noise, float))
 
 
 def test_the_noise_of_a_view_holds_that_of_many_beams_and_without_aperture_is_the_detection_s():
     """Of elevations anywhere in the aperture, for a length that is taken at elevation zero."""
     elevation = np.random.default_rng(3).uniform(-APERTURE_RAD / 2, APERTURE_RAD / 2, 200_000)
-    wide = 1e3 * np.eye(3)
-    V = far(wide, np.eye(3), 40.0, np.zeros((2, 2)))[1] - wide
+    V = far_covariance(np.zeros((2, 2)), 40.0, APERTURE_RAD)
     assert V[0, 0] == pytest.approx(np.mean(np.square(40.0 * (1 - np.cos(elevation)))), rel=0.02)
     assert V[2, 2] == pytest.approx(np.var(elevation), rel=0.02)
     noise = np.array([[0.04, -0.003], [-0.003, 0.0009]])
-    V = far(1e6 * np.eye(3), np.eye(3), 40.0, noise, aperture_rad=0.0)[1] - 1e6 * np.eye(3)
-    assert_allclose(V, np.pad(noise, (0, 1)), atol=1e-9)
+    assert_array_equal(far_covariance(noise, 40.0, 0.0), np.pad(noise, (0, 1)))
 
 
-def test_a_kernel_widens_the_noise_of_a_far_view_as_that_of_a_near_one():
-    G_z, noise, missed = np.diag([1.0, 10.0, 10.0]), np.diag([0.04, 0.0009]), (9.0, 7.0, 0.0)
-    cov = np.diag([1.0, 9.0, 1.0])
-    _, plain, e, S = far(cov, G_z, 10.0, noise, missed)
-    widened = admitted(e, S, noise, kernel_width=1.5)[1]
-    assert widened[0, 0] > noise[0, 0]
-    _, wide, *same = far(cov, G_z, 10.0, noise, missed, kernel_width=1.5)
-    assert_allclose(wide - plain, G_z[:, :2] @ widened @ G_z[:, :2].T, atol=1e-12)
-    for part, other in zip(same, (e, S), strict=True):
-        assert_array_equal(part, other)
+def test_gate_and_kernel_judge_a_far_view_by_its_shift_along_the_beam_and_across_it():
+    G_z, noise, missed = TURNED @ np.diag([1.0, 10.0, 10.0]), np.diag([0.04, 0.0009]), np.array([9.0, 7.0, 0.0])
+    S = TURNED @ np.diag([1.0, 9.0, 1.0]) @ TURNED.T
+    outcome, e, S_z, widened = judged_far(TURNED @ missed, S, G_z, noise, math.inf, 1.5)
+    assert_allclose(e, [9.0, 0.7], atol=1e-12)
+    assert_allclose(S_z, np.diag([1.0, 0.09]), atol=1e-12)
+    expected = judged(e, S_z, noise, math.inf, 1.5)
+    assert outcome == expected[0] == USED
+    assert_allclose(widened, G_z[:, :2] @ expected[1] @ G_z[:, :2].T, atol=1e-12)
+    assert judged_far(TURNED @ missed, S, G_z, noise, 3.7, 1.5)[0] == GATED
 
 
 def test_linear_is_what_errs_by_less_than_the_noise():
     """Sagitta of an exact circle: across a beam of 10 m, sigma 1 m, a range is 5 cm longer."""
     G_z, longer_m = np.diag([1.0, 10.0, 10.0]), np.hypot(10.0, 1.0) - 10.0
     for share, is_linear in ((1.05, True), (0.95, False)):
-        assert (far(np.diag([0.0, 1.0, 0.0]), G_z, 10.0, np.diag([(share * longer_m) ** 2, 1.0])) is None) == is_linear
+        assert far(np.diag([0.0, 1.0, 0.0]), G_z, 10.0, np.diag([(share * longer_m) ** 2, 1.0])) != is_linear
     for sigma, is_linear in ((0.0101, True), (0.0099, False)):
-        assert (far(np.diag([1.0, 1.0, 0.0]), G_z, 10.0, np.diag([1.0, sigma**2])) is None) == is_linear
-    assert far(1e6 * np.diag([0.0, 0.0, 1.0]), G_z, 10.0, np.diag([1e-4, 1e-4])) is None
-
-
-TURNED = Rotation.from_euler("xyz", [0.4, -0.7, 1.9]).as_matrix()
+        assert far(np.diag([1.0, 1.0, 0.0]), G_z, 10.0, np.diag([1.0, sigma**2])) != is_linear
+    assert not far(1e6 * np.diag([0.0, 0.0, 1.0]), G_z, 10.0, np.diag([1e-4, 1e-4]))
 
 
 @pytest.mark.parametrize("range_m", [10.0, 3.0])
-def test_a_shift_and_what_is_linear_are_the_same_wherever_the_sonar_points(range_m):
-    """Of range and azimuth, blind to elevation; with 0.3 m along and 0.2 m across, 2 % on each side of linear."""
+def test_what_is_linear_is_the_same_wherever_the_sonar_points(range_m):
+    """Blind to elevation; with 0.3 m along and 0.2 m across, 2 % on each side of linear."""
     G_z, cov = TURNED @ np.diag([1.0, range_m, range_m]), TURNED @ np.diag([0.09, 0.04, 4.0]) @ TURNED.T
-    shift = far(1e6 * np.eye(3), G_z, range_m, np.eye(2), G_z @ [0.3, 0.02, 5.0])[2]
-    assert_allclose(shift, [0.3, 0.02], atol=1e-12)
     longer_m, turned_rad = 0.04 / (2 * range_m), 0.3 * 0.2 / range_m**2
     for share, is_linear in ((0.98, False), (1.02, True)):
-        assert (far(cov, G_z, range_m, np.diag([(share * longer_m) ** 2, 9.0])) is None) == is_linear
-        assert (far(cov, G_z, range_m, np.diag([9.0, (share * turned_rad) ** 2])) is None) == is_linear
+        assert far(cov, G_z, range_m, np.diag([(share * longer_m) ** 2, 9.0])) != is_linear
+        assert far(cov, G_z, range_m, np.diag([9.0, (share * turned_rad) ** 2])) != is_linear
 
 
 @pytest.mark.parametrize("direction", [(2.0, 1.0), (2.0, -1.0), (1.0, 0.0)])
@@ -309,8 +296,9 @@ def test_the_gate_is_an_ellipse_of_a_correlated_innovation(direction):
 
 
 def admitted(e, S, R_z=NOISE, *, gate_probability=1.0, kernel_width=0.0):
-    """Judgement of the first detection by these settings."""
-    return admit(np.array(e), np.array(S), R_z, Gate.of(gate_probability, kernel_width), 0)
+    """Judgement by these settings."""
+    gate = math.sqrt(chi2.ppf(gate_probability, 2))
+    return judged(np.array(e, float), np.array(S), R_z, gate, kernel_width or math.inf)
 
 
 def test_a_kernel_weighs_range_and_azimuth_each_as_in_the_graph():
@@ -332,56 +320,32 @@ def test_an_outlier_moves_a_filter_with_a_kernel_less_and_what_agrees_as_much(fi
         moved = []
         for kernel_width in (0.0, 1.5):
             slam = begun(filter_, world, P, gate=1.0, kernel_width=kernel_width)
-            slam.observe(MOTION, 0, z + np.array([1e-6 + off, 0.0]), NOISE, may_be_far=False)
+            slam.observe(MOTION, 0, z + np.array([1e-6 + off, 0.0]), NOISE)
             moved.append(np.linalg.norm(filter_.estimate(slam)[0].landmarks - world.landmarks))
         assert shares[0] - 1e-3 < moved[1] / moved[0] < shares[1] + 1e-3
 
 
-def judge(gate, squared, times=1, landmark=3):
-    """Outcomes and what the kernel adds, of detections at a squared distance along the range."""
-    return [admit(np.array([math.sqrt(squared), 0.0]), np.eye(2), NOISE, gate, landmark) for _ in range(times)]
+def log_of(squared):
+    """Log of detections at these squared distances along the range; NaN: without an innovation."""
+    e = np.column_stack([np.sqrt(squared), np.zeros(len(squared))])
+    stamps_ns = np.arange(len(squared))
+    outcomes = [Outcome.USED] * len(squared)
+    return DetectionLog(stamps_ns, stamps_ns, e, np.tile(np.eye(2), (len(squared), 1, 1)), outcomes)
 
 
-def outcomes(told):
-    return [outcome for outcome, _ in told]
-
-
-def test_a_gate_refuses_a_few_outliers_and_opens_when_most_are():
-    """Of the last ten; it closes again when most are not. One in a thousand right ones is an outlier."""
-    gate = Gate.of(0.99, 0.0)
-    assert JUDGED_TOGETHER == 10
-    assert pytest.approx(chi2.ppf(0.999, 2)) == OUTLYING
-    assert outcomes(judge(gate, 1.0, 7) + judge(gate, 100.0, 8)) == [USED] * 7 + [GATED] * 5 + [LET_IN] * 3
-    assert outcomes(judge(gate, 1.0, 5) + judge(gate, 100.0)) == [USED] * 5 + [GATED]
-    assert outcomes(judge(gate, math.nan)) == [GATED]  # no distance
-    always = Gate.of(0.99, 0.0)  # outside the gate, but no outliers
-    assert outcomes(judge(always, OUTLYING - 0.1, 20)) == [GATED] * 20
-
-
-@pytest.mark.parametrize("kernel_width", [0.0, 1.5])
-def test_an_open_gate_is_the_ellipse_times_what_makes_the_median_fit_without_kernel(kernel_width):
-    """So that it goes on refusing what is a wrong name even then."""
-    gate = Gate.of(0.99, kernel_width)
-    judge(gate, 1.0, 6)
-    judge(gate, 200.0, 10)
-    judge(gate, 1e5, 4)  # wrong names among them
-    limit = gate_threshold(0.99, 2) * 200.0 / chi2.ppf(0.5, 2)
-    told = [judge(gate, squared, landmark=5)[0] for squared in (9.2, 9.3, 0.999 * limit, 1.001 * limit)]
-    assert outcomes(told) == [USED, LET_IN, LET_IN, GATED]
-    assert not np.any([widened for _, widened in told])
-
-
-def test_a_landmark_that_began_by_a_wrong_name_opens_no_gate_even_if_the_same_confusion_returns():
-    """Nor is it let in where one that has agreed opens it; that takes as many agreements as outliers."""
-    gate = Gate.of(0.99, 0.0)
-    judge(gate, 1.0, 16, landmark=3)
-    for _ in range(5):
-        told = judge(gate, 1.0, landmark=7) + judge(gate, 1e5, 20, landmark=7)
-        assert outcomes(told) == [USED] + [GATED] * 20
-    assert outcomes(judge(gate, 30.0, 6))[-1] == LET_IN
-    assert outcomes(judge(gate, 1e5, landmark=7)) == [GATED]
-    judge(gate, 1.0, 10)
-    assert outcomes(judge(gate, 1.0, landmark=7) + judge(gate, 1e5, 6, landmark=7))[-1] == LET_IN
+def test_a_lock_out_is_named_where_outliers_are_far_more_than_noise_and_a_tenth_explain():
+    rng = np.random.default_rng(0)
+    noise = chi2.ppf(rng.random(2000), 2)
+    tenth = np.where(rng.random(2000) < 0.1, 1e3, noise)
+    third = np.where(rng.random(2000) < 0.33, 1e3, noise)
+    new = np.full(50, np.nan)
+    assert lockout_messages(log_of(new)) == []
+    for squared in (noise, tenth, np.full(1, 1e3), noise[:3]):
+        assert lockout_messages(log_of(np.concatenate([new, squared]))) == []
+    (message,) = lockout_messages(log_of(np.concatenate([new, third])))
+    outliers = int(np.sum(third > chi2.ppf(0.999, 2)))
+    assert message.startswith(f"{outliers} of 2000 detections of known landmarks lie outside")
+    assert "kernel_width = 0" in message
 
 
 BEFORE_S, LOST_S, AFTER_S = 25.0, 120.0, np.array([3.0, 10.0, 20.0])
@@ -400,11 +364,10 @@ def nees_after_gap(filter_, seed, forgets_gap):
     closed_ns = lost.stamps_ns[first_after + 1]  # the second row confirms the first
     after_ns = closed_ns + np.round(AFTER_S * NS_PER_S).astype(np.int64)
     sequence = Sequence("gap", mission.calibration, mission.imu, lost, None, mission.detections)
-    estimator, squares = filter_.kind(mission.calibration, Odometry(mission.calibration)), []
+    params = filter_.kind.Params(far_views=not forgets_gap)
+    estimator, squares = filter_.kind(mission.calibration, Odometry(mission.calibration), params), []
     for window in sequence.replay(np.r_[closed_ns + NS_PER_S // 50, after_ns]):
         estimate = estimator.process(window)
-        if forgets_gap:
-            estimator._was_lost = False
         if window.end_ns in after_ns:
             world_T_body = estimate.world_T_body
             error = world_T_body.translation() - mission.truth.at(np.array([window.end_ns])).positions[0]

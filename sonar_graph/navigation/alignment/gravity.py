@@ -18,7 +18,7 @@ import numpy as np
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Floats
 from sonar_graph.motion import PreintegratedMotion
-from sonar_graph.numerics import compiled, mat, vec
+from sonar_graph.numerics import compiled
 
 LEAST_GYRO_NOISE_DENSITY = 1e-7
 """rad/s/√Hz, ten times below the best fibre gyros: keeps tau finite for a gyro without noise."""
@@ -49,9 +49,8 @@ def gravity_direction(
 @compiled
 def up_direction(force: Floats, i_R_j: Floats, velocity_i: Floats, velocity_j: Floats, duration_s: float) -> Floats:
     """up_j of the mean specific force in frame i, shape (3,); NaN where the force is not measured."""
-    dR = mat(i_R_j)
-    g_j = dR.T @ (vec(force) - (1.0 / duration_s) * (dR @ vec(velocity_j) - vec(velocity_i)))
-    return np.array((1.0 / math.sqrt(g_j @ g_j)) * g_j)
+    g_i = force - (i_R_j @ velocity_j - velocity_i) / duration_s
+    return i_R_j.T @ g_i / math.sqrt(g_i @ g_i)
 
 
 def tilt_sigma(

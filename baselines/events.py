@@ -1,0 +1,204 @@
+"""Events of a call of a filter in their order, and the motions that lead to them.
+
+A filter's state sits at an epoch, a stamp of the Doppler log. Events happen in the order of their stamps, whatever the
+calls in which measurements arrive: an epoch when it is reached, a depth sample, a heading, a position fix, then the
+detections of a frame. A measurement is related to the newest epoch reached by then, through a motion from rows stamped
+no later::
+
+    epoch i --- epoch j          predict; then the plane, and gravity where an interval of it ends at j
+          i -------- t           depth, heading, position fix, frame, or estimate at the end of the call
+    t' ------ i                  position fix that comes late, by the motion backwards
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sonar_graph.measurements import Floats, Ints
+from sonar_graph.models import ACCEPTED, Mount, floor_elevation
+from sonar_graph.numerics import compiled, cross_matrix, rotation_exp
+
+EPOCH, DEPTH, HEADING, FIX, FRAME, END = range(6)
+"""Kinds of events; at equal stamps the lower comes first."""
+NOT_STARTED, LONG_AGO = int(np.iinfo(np.int64).max), int(np.iinfo(np.int64).min)
+
+
+class Motion(NamedTuple):
+    """One row of `Motions`."""
+
+    dR: Floats
+    """i_R_j, shape (3, 3)."""
+    dp: Floats
+    """i_p_j, shape (3,), m."""
+    C: Floats
+    """Covariance of [theta, rho] in frame j, shape (6, 6)."""
+    D: Floats
+    """Derivative of [theta, rho] by the gyro bias, shape (6, 3)."""
+    impulse: Floats
+    """Integral of the specific force in frame i, shape (3,), m/s."""
+
+
+class Sonar(NamedTuple):
+    """Sonar and floor, and the treatment of doubtful detections."""
+
+    mount: Mount
+    aperture_rad: float
+    floor_z_m: float
+    """NaN where it is not known."""
+    floor_variance_m2: float
+    gate: float
+    """Mahalanobis distance beyond which a detection is refused."""
+    kernel_width: float
+    """Of the Cauchy kernel, in standard deviations; infinite: none."""
+
+
+class Samples(NamedTuple):
+    """Depths, headings and position fixes of a call, in order."""
+
+    stamp_ns: Ints
+    kind: Ints
+    value: Floats
+    """Shape (s, 3): the position of a fix, the height of a depth sample as last number, the yaw as first."""
+    noise: Floats
+    """Covariances, shape (s, 3, 3), in the same places."""
+
+
+class Views(NamedTuple):
+    """Detections of a call: range and azimuth z (m, 2) with covariance R_z, innovation e with S (NaN without one)."""
+
+    stamp_ns: Ints
+    slot: Ints
+    """Number of the landmark in the state; the next free one for a new landmark."""
+    z: Floats
+    R_z: Floats
+    outcome: NDArray[np.int8]
+    """`OUTCOME_NUMBERS`, or ACCEPTED: to be used."""
+    e: Floats
+    S: Floats
+
+
+def in_frame(views: Views, first: int) -> list[int]:
+    """Detections of a frame that are to be used, of which one is given."""
+    return np.flatnonzero((views.stamp_ns == views.stamp_ns[first]) & (views.outcome == ACCEPTED)).tolist()
+
+
+@compiled
+def read_detections(range_m: Floats, azimuth_rad: Floats, logged: Floats, R_z: Floats) -> tuple[Floats, Floats]:
+    """Detections z (m, 2) and their covariances (m, 2, 2): symmetric, and R_z where the log has none."""
+    z = np.empty((len(range_m), 2))
+    noise = np.empty((len(range_m), 2, 2))
+    for k in range(len(z)):
+        z[k, 0] = range_m[k]
+        z[k, 1] = azimuth_rad[k]
+        across = 0.5 * (logged[k, 0, 1] + logged[k, 1, 0])
+        is_known = not math.isnan(logged[k, 0, 0] + across + logged[k, 1, 1])
+        noise[k, 0, 0] = logged[k, 0, 0] if is_known else R_z[0, 0]
+        noise[k, 1, 1] = logged[k, 1, 1] if is_known else R_z[1, 1]
+        noise[k, 0, 1] = across if is_known else R_z[0, 1]
+        noise[k, 1, 0] = noise[k, 0, 1]
+    return z, noise
+
+
+class Order(NamedTuple):
+    """Events in their order, as columns."""
+
+    stamp_ns: Ints
+    """When they happen; no row stamped later is used."""
+    start_ns: Ints
+    """Newest epoch, at which the motion to an event begins."""
+    end_ns: Ints
+    """Instant at which that motion ends."""
+    kind: Ints
+    row: Ints
+    """Number of the sample, or of the first detection of the frame."""
+    ends_interval: Ints
+    """1 where an interval of gravity ends at an epoch, else 0."""
+
+
+class Call(NamedTuple):
+    """Times of a call of a filter."""
+
+    since_ns: int
+    """Samples stamped earlier are passed over."""
+    end_ns: int
+    node_ns: int
+    """Epoch of the state before the call."""
+    opened_ns: int
+    """Epoch at which the interval of gravity began."""
+    interval_ns: int
+    """Least length of an interval of gravity; 0: gravity is not used."""
+
+
+@compiled
+def in_order(epochs_ns: Ints, reached_ns: Ints, sample_ns: Ints, sample_kind: Ints, views: Views, call: Call) -> Ints:
+    """Order the epochs, samples and frames of a call, which end with `END`; columns of `Order` as rows, shape (6, n)."""
+    out = np.empty((6, len(epochs_ns) + len(sample_ns) + len(views.stamp_ns) + 1), np.int64)
+    n = epoch = sample = view = 0
+    node_ns = call.node_ns
+    opened_ns = call.opened_ns
+    frame_ns = LONG_AGO
+    kind = EPOCH
+    while kind != END:
+        while sample < len(sample_ns) and sample_ns[sample] < call.since_ns:
+            sample += 1
+        while view < len(views.stamp_ns) and (views.stamp_ns[view] == frame_ns or views.outcome[view] != ACCEPTED):
+            view += 1
+        # the earliest of what comes next; at equal stamps the lower kind
+        kind = END
+        stamp_ns = call.end_ns
+        row = 0
+        if view < len(views.stamp_ns):
+            kind = FRAME
+            stamp_ns = views.stamp_ns[view]
+            row = view
+        if sample < len(sample_ns) and sample_ns[sample] <= stamp_ns:
+            kind = sample_kind[sample]
+            stamp_ns = sample_ns[sample]
+            row = sample
+        if epoch < len(epochs_ns) and reached_ns[epoch] <= stamp_ns:
+            kind = EPOCH
+            stamp_ns = reached_ns[epoch]
+            row = epoch
+        out[0, n] = stamp_ns
+        out[1, n] = node_ns
+        out[2, n] = epochs_ns[row] if kind == EPOCH else stamp_ns
+        out[3, n] = kind
+        out[4, n] = row
+        out[5, n] = 0
+        if kind == EPOCH:
+            epoch += 1
+            node_ns = epochs_ns[row]
+            if 0 < call.interval_ns <= node_ns - opened_ns:
+                out[5, n] = 1
+                opened_ns = node_ns
+        elif kind == FRAME:
+            frame_ns = stamp_ns
+        elif kind != END:
+            sample += 1
+        n += 1
+    return out[:, :n].copy()
+
+
+@compiled
+def remove_rate(motion: Motion, bias: Floats, earth: Floats) -> Motion:
+    """Motion without a gyro bias and the Earth's rate (frame i, both in rad/s), to first order.
+
+    For gyros the Earth's rate is a bias, the mean of its values in frames i and j. The specific force turns by half of
+    the correction of the rotation.
+    """
+    dR, dp, C, D, impulse = motion
+    rate = bias + 0.5 * (earth + dR.T @ earth)
+    theta = D[:3] @ rate
+    rho = D[3:] @ rate
+    impulse = impulse + 0.5 * cross_matrix(dR @ theta) @ impulse
+    return Motion(dR @ rotation_exp(theta), dp + dR @ rho, C, D, impulse)
+
+
+def elevation_of_new(R: Floats, X: Floats, sonar: Sonar, z: Floats) -> float:
+    """Elevation of a new landmark seen by a body at (R, X): on the floor; 0 without a floor within the aperture."""
+    up = sonar.mount.body_R_sonar.T @ R[2]  # in the sonar's axes
+    height_m = sonar.floor_z_m - (X + R @ sonar.mount.body_p_sonar)[2]
+    elevation_rad = floor_elevation(up, height_m, z[0], z[1])
+    return elevation_rad if abs(elevation_rad) <= 0.5 * sonar.aperture_rad else 0.0

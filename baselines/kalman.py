@@ -1,0 +1,138 @@
+"""Kalman update of both filters, and the treatment of doubtful detections: gate, robust kernel, far landmarks.
+
+Derivation: docs/theory/fair_comparison.md (gate, kernel), docs/theory/gaps.md (far landmarks).
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from sonar_graph.measurements import Floats
+from sonar_graph.numerics import compiled
+from sonar_graph.states import OUTCOME_NUMBERS, Outcome
+
+USED = OUTCOME_NUMBERS[Outcome.USED]
+GATED = OUTCOME_NUMBERS[Outcome.GATED]
+NEW = OUTCOME_NUMBERS[Outcome.NEW]
+
+
+class Judged(NamedTuple):
+    """Range and azimuth of a known landmark, after the update."""
+
+    outcome: int
+    """`USED` or `GATED`."""
+    e: Floats
+    """Innovation, shape (2,)."""
+    S: Floats
+    """Covariance of the innovation, shape (2, 2)."""
+
+
+@compiled
+def correction(P: Floats, H: Floats, e: Floats, R: Floats) -> Floats:
+    """``K e``, shape (n,), with ``K = P H^T S^-1`` and ``S = H P H^T + R``; P becomes ``P - K S K^T``.
+
+    Raises LinAlgError where S is not positive definite.
+    """
+    HP = H @ P  # (m, n)
+    S = HP @ H.T + R  # (m, m)
+    L_inverse = np.linalg.inv(np.linalg.cholesky(S))
+    V = L_inverse @ HP  # (m, n): K e = V^T L^-1 e, K S K^T = V^T V
+    for r in range(len(V)):
+        for i in range(len(P)):
+            for j in range(len(P)):
+                P[i, j] -= V[r, i] * V[r, j]  # the factors commute: P stays symmetric to the last bit
+    return V.T @ (L_inverse @ e)
+
+
+@compiled
+def symmetric(A: Floats) -> Floats:
+    """``(A + A^T) / 2``."""
+    return 0.5 * (A + A.T)
+
+
+def bordered(P: Floats, P_pv: Floats, P_pp: Floats) -> Floats:
+    """``[ P  P_pv^T ; P_pv  P_pp ]``."""
+    n = len(P)
+    whole = np.empty((n + len(P_pp), n + len(P_pp)))
+    whole[:n, :n] = P
+    whole[n:, :n] = P_pv
+    whole[:n, n:] = P_pv.T
+    whole[n:, n:] = P_pp
+    return whole
+
+
+@compiled
+def distance(e: Floats, S: Floats) -> float:
+    """``sqrt(e^T S^-1 e)``, the Mahalanobis distance of an innovation."""
+    return math.sqrt(e @ np.linalg.inv(S) @ e)
+
+
+@compiled
+def judged(e: Floats, S: Floats, R_z: Floats, gate: float, kernel_width: float) -> tuple[int, Floats]:
+    """Outcome of an innovation of range and azimuth, and what a Cauchy kernel adds to R_z, shape (2, 2).
+
+    `GATED` where the `distance` exceeds the gate. The kernel has the weight ``w_i = 1 / (1 + e_i^2 / (S_ii k^2))`` and
+    makes ``R_ij / sqrt(w_i w_j)`` of the noise; an infinite width k adds nothing.
+    """
+    if not distance(e, S) <= gate:
+        return GATED, np.zeros((2, 2))
+    spread = np.empty(2)  # 1 / sqrt(w)
+    for i in range(2):
+        spread[i] = math.sqrt(1.0 + e[i] ** 2 / (S[i, i] * kernel_width**2))
+    widened = np.empty((2, 2))
+    for i in range(2):
+        for j in range(2):
+            widened[i, j] = (spread[i] * spread[j] - 1.0) * R_z[i, j]
+    return USED, widened
+
+
+def is_far(cov: Floats, G_z: Floats, range_m: float, R_z: Floats) -> bool:
+    """Check that a view linearised at the predicted place errs by more than its noise.
+
+    With the variances A along the beam and L across it, in the sonar's plane, of a landmark's place relative to the
+    vehicle, the linearisation leaves out ``L / (2 r)`` of the range and ``sqrt(L A) / r^2`` of the azimuth.
+
+    Parameters
+    ----------
+    cov
+        Covariance of that relative place, shape (3, 3).
+    G_z
+        Derivative of the point seen by (range, azimuth, elevation), shape (3, 3).
+    """
+    along = G_z[:, 0].copy()
+    across = G_z[:, 1].copy()  # of length r
+    A = along @ cov @ along
+    L = across @ cov @ across / range_m**2
+    return 2.0 * range_m * math.sqrt(R_z[0, 0]) < L or range_m**4 * R_z[1, 1] < L * A
+
+
+def polar_covariance(R_z: Floats, aperture_rad: float) -> Floats:
+    """Covariance of range, azimuth and elevation (3, 3); the latter is uniform in the aperture: ``aperture^2 / 12``."""
+    V = np.zeros((3, 3))
+    V[:2, :2] = R_z
+    V[2, 2] = aperture_rad**2 / 12.0
+    return V
+
+
+def far_covariance(R_z: Floats, range_m: float, aperture_rad: float) -> Floats:
+    """`polar_covariance` of a point at elevation 0: a beam that is not level reaches ``r e^2 / 2`` less far."""
+    V = polar_covariance(R_z, aperture_rad)
+    V[0, 0] += range_m**2 * aperture_rad**4 / 320.0
+    return V
+
+
+def judged_far(
+    e: Floats, S: Floats, G_z: Floats, R_z: Floats, gate: float, kernel_width: float
+) -> tuple[int, Floats, Floats, Floats]:
+    """`judged` for an innovation of a point, by its share along the beam and across it.
+
+    Returns the outcome; the innovation of range and azimuth, shape (2,), and its covariance; and what the kernel adds
+    to the covariance of the point, shape (3, 3).
+    """
+    beam = G_z[:, :2].copy()  # derivatives by range and azimuth, orthogonal
+    B = (beam / np.sum(beam * beam, axis=0)).T.copy()  # range and azimuth by the point
+    e_z = B @ e
+    S_z = B @ S @ B.T
+    outcome, widened = judged(e_z, S_z, R_z, gate, kernel_width)
+    return outcome, e_z, S_z, beam @ widened @ beam.T
