@@ -9,13 +9,13 @@ from sonar_graph.numerics.matrices import (
     cross, curvature, diagonal, euler_from_rotation, euler_rates_from_body, exp_and_mean, mat, mat6, outer, quaternion,
     rodrigues, rotation_from_euler, rotation_log, skew, store, store6, vec,
 )
-from sonar_graph.numerics.rotations import cross_matrix, running_rotations
+from sonar_graph.numerics.rotations import cross_matrix, left_jacobian, rotation_exp, running_rotations
 
 __all__ = [
     "I3", "LOWER_LEFT", "LOWER_RIGHT", "Mat3", "Mat6", "O3", "UPPER_RIGHT", "Vec3", "Vec6", "ZERO",
     "body_rates_from_euler", "chi_square_share", "chi_square_quantile", "chi_square_exceeded", "chord_inverse",
     "compiled", "compiling_s", "cross", "cross_matrix", "curvature", "diagonal", "euler_from_rotation",
-    "euler_rates_from_body", "exp_and_mean", "inlined", "mat", "mat6", "outer", "quaternion",
-    "rodrigues", "rotation_from_euler", "rotation_log", "running_rotations", "skew", "store", "store6",
+    "euler_rates_from_body", "exp_and_mean", "inlined", "left_jacobian", "mat", "mat6", "outer", "quaternion",
+    "rodrigues", "rotation_exp", "rotation_from_euler", "rotation_log", "running_rotations", "skew", "store", "store6",
     "vec",
 ]
