@@ -163,9 +163,7 @@ def observe(
     return outcome, e, S
 
 
-def observe_far(
-    x: Floats, P: Floats, at: int, motion: Motion, sonar: Sonar, z: Floats, R_z: Floats
-) -> Judged | None:
+def observe_far(x: Floats, P: Floats, at: int, motion: Motion, sonar: Sonar, z: Floats, R_z: Floats) -> Judged | None:
     """Update as `observe` by a landmark far from where it is predicted, ``0 = g(x_v, z) - p``; None if it is near."""
     R, X, T = pose_after(x, motion)
     g, G_b, G_z = locate_from_body(R, X, sonar.mount, z, 0.0)
@@ -200,7 +198,7 @@ def update_heading(
 ) -> float:
     """Update by a compass, ``psi' + c``, with Huber's kernel.
 
-    Returns the distance from the yaw in sigmas, in which the bias of the compass is noise of the calibration's variance.
+    Returns the distance from the yaw in sigmas, in which the bias of the compass counts as noise.
     """
     R, _, T = pose_after(x, motion)
     yaw, by_turn = yaw_and_derivative(R)

@@ -50,7 +50,6 @@ from sonar_graph.models import (
     MINIMUM_PROBABILITY,
     Contradictions,
     Mount,
-    bias_sigmas,
     identify,
 )
 from sonar_graph.motion import MotionSource, PreintegratedMotion, require_source
@@ -214,7 +213,8 @@ class FilterShell(ABC):
         """world_R_body of the state, shape (3, 3)."""
 
     def check(self, epoch_ns: int) -> None:
-        """Look at the state after an event."""
+        """Look at the state after an event; nothing by default."""
+        del epoch_ns
 
     def gyro_bias(self) -> Floats:
         """Estimated gyro bias, shape (3,), rad/s; zero where the state has none."""
@@ -316,9 +316,7 @@ class FilterShell(ABC):
         for row in np.flatnonzero(outcome == ACCEPTED).tolist():
             # a new landmark gets the next number: rows are used in their order
             slot[row] = self._slots.setdefault(int(ids[row]), len(self._slots))
-        z, R_z = read_detections(
-            detections.range_m, detections.azimuth_rad, detections.range_azimuth_cov, self._R_z
-        )
+        z, R_z = read_detections(detections.range_m, detections.azimuth_rad, detections.range_azimuth_cov, self._R_z)
         e = np.full((len(ids), 2), math.nan)
         S = np.full((len(ids), 2, 2), math.nan)
         return ids, Views(stamps_ns, slot, z, R_z, outcome, e, S)
@@ -341,9 +339,13 @@ class FilterShell(ABC):
             return NO_SAMPLES
         if len(blocks) == 1:
             return blocks[0]
-        samples = Samples(*(np.concatenate(columns) for columns in zip(*blocks, strict=True)))
-        order = np.argsort(samples.stamp_ns, kind="stable")
-        return Samples(*(column[order] for column in samples))
+        samples = Samples(
+            stamp_ns=np.concatenate([block.stamp_ns for block in blocks]),
+            kind=np.concatenate([block.kind for block in blocks]),
+            value=np.concatenate([block.value for block in blocks]),
+            noise=np.concatenate([block.noise for block in blocks]),
+        )
+        return _rows(samples, np.argsort(samples.stamp_ns, kind="stable"))
 
     def _depths(self, depth: Depth) -> Samples:
         """Depths, with the calibration's noise where they have none."""
@@ -474,9 +476,7 @@ class FilterShell(ABC):
         """
         kind = int(order.kind[k])
         end_ns = int(order.end_ns[k])
-        over = self.odometry.motion(
-            self.node_ns, end_ns, self.gyro_bias(), self.attitude(), int(order.stamp_ns[k])
-        )
+        over = self.odometry.motion(self.node_ns, end_ns, self.gyro_bias(), self.attitude(), int(order.stamp_ns[k]))
         motion = motion_of(over)
         if not np.isfinite(motion.dp).all():
             raise EstimatorError(f"{self.name}: the motion to {end_ns} ns over a gap is not finite")
@@ -557,8 +557,9 @@ def lockout_messages(log: DetectionLog) -> list[str]:
         return []
     return [
         f"{outliers} of {len(e)} detections of known landmarks lie outside the 99.9 % ellipse of their innovation, far"
-        " more than noise and a tenth of wrong detections explain: the filter is wrong, not they, and its gate or kernel"
-        " keeps right detections from correcting it; give gate_probability = 1 and kernel_width = 0, or larger noise"
+        " more than noise and a tenth of wrong detections explain: the filter is wrong, not they, and its gate or"
+        " kernel keeps right detections from correcting it; give gate_probability = 1 and kernel_width = 0, or larger"
+        " noise"
     ]
 
 
@@ -571,5 +572,5 @@ def _samples(stamps_ns: Ints, kind: int, value: Floats, noise: Floats) -> Sample
     return Samples(stamps_ns, np.full(n, kind), value, noise)
 
 
-def _rows(samples: Samples, selection: slice | NDArray[np.bool_]) -> Samples:
-    return Samples(*(column[selection] for column in samples))
+def _rows(samples: Samples, rows: Ints | NDArray[np.bool_]) -> Samples:
+    return Samples(samples.stamp_ns[rows], samples.kind[rows], samples.value[rows], samples.noise[rows])

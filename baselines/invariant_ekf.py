@@ -190,9 +190,7 @@ def observe(
     return outcome, e, S
 
 
-def observe_far(
-    state: InvariantState, k: int, motion: Motion, sonar: Sonar, z: Floats, R_z: Floats
-) -> Judged | None:
+def observe_far(state: InvariantState, k: int, motion: Motion, sonar: Sonar, z: Floats, R_z: Floats) -> Judged | None:
     """Update as `observe` by a landmark far from where it is predicted, by the point seen, (6); None if it is near.
 
     Exp(theta) turns both points: the innovation is ``xi_k - xi_new``, without theta however far they are apart.
@@ -242,7 +240,7 @@ def update_heading(
 ) -> float:
     """Update by a compass, (10), with Huber's kernel.
 
-    Returns the distance from the yaw in sigmas, in which the bias of the compass is noise of the calibration's variance.
+    Returns the distance from the yaw in sigmas, in which the bias of the compass counts as noise.
     """
     R, _, D = pose_after(state, motion)
     yaw, by_turn = yaw_and_derivative(R)
