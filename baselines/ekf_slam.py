@@ -198,7 +198,7 @@ def update_heading(
 ) -> float:
     """Update by a compass, ``psi' + c``, with Huber's kernel.
 
-    Returns the distance from the yaw in sigmas, in which the bias of the compass is noise of the calibration's variance.
+    Returns the distance from the yaw in sigmas, in which the bias of the compass counts as noise.
     """
     R, _, T = pose_after(x, motion)
     yaw, by_turn = yaw_and_derivative(R)

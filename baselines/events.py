@@ -133,7 +133,7 @@ class Call(NamedTuple):
 
 @compiled
 def in_order(epochs_ns: Ints, reached_ns: Ints, sample_ns: Ints, sample_kind: Ints, views: Views, call: Call) -> Ints:
-    """Order the epochs, samples and frames of a call, which end with `END`; columns of `Order` as rows, shape (6, n)."""
+    """Order the epochs, samples and frames of a call up to `END`; columns of `Order` as rows, shape (6, n)."""
     out = np.empty((6, len(epochs_ns) + len(sample_ns) + len(views.stamp_ns) + 1), np.int64)
     n = epoch = sample = view = 0
     node_ns = call.node_ns

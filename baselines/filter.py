@@ -213,7 +213,8 @@ class FilterShell(ABC):
         """world_R_body of the state, shape (3, 3)."""
 
     def check(self, epoch_ns: int) -> None:
-        """Look at the state after an event."""
+        """Look at the state after an event; nothing by default."""
+        del epoch_ns
 
     def gyro_bias(self) -> Floats:
         """Estimated gyro bias, shape (3,), rad/s; zero where the state has none."""
@@ -338,9 +339,13 @@ class FilterShell(ABC):
             return NO_SAMPLES
         if len(blocks) == 1:
             return blocks[0]
-        samples = Samples(*(np.concatenate(columns) for columns in zip(*blocks, strict=True)))
-        order = np.argsort(samples.stamp_ns, kind="stable")
-        return Samples(*(column[order] for column in samples))
+        samples = Samples(
+            stamp_ns=np.concatenate([block.stamp_ns for block in blocks]),
+            kind=np.concatenate([block.kind for block in blocks]),
+            value=np.concatenate([block.value for block in blocks]),
+            noise=np.concatenate([block.noise for block in blocks]),
+        )
+        return _rows(samples, np.argsort(samples.stamp_ns, kind="stable"))
 
     def _depths(self, depth: Depth) -> Samples:
         """Depths, with the calibration's noise where they have none."""
@@ -552,8 +557,9 @@ def lockout_messages(log: DetectionLog) -> list[str]:
         return []
     return [
         f"{outliers} of {len(e)} detections of known landmarks lie outside the 99.9 % ellipse of their innovation, far"
-        " more than noise and a tenth of wrong detections explain: the filter is wrong, not they, and its gate or kernel"
-        " keeps right detections from correcting it; give gate_probability = 1 and kernel_width = 0, or larger noise"
+        " more than noise and a tenth of wrong detections explain: the filter is wrong, not they, and its gate or"
+        " kernel keeps right detections from correcting it; give gate_probability = 1 and kernel_width = 0, or larger"
+        " noise"
     ]
 
 
@@ -566,5 +572,5 @@ def _samples(stamps_ns: Ints, kind: int, value: Floats, noise: Floats) -> Sample
     return Samples(stamps_ns, np.full(n, kind), value, noise)
 
 
-def _rows(samples: Samples, selection: slice | NDArray[np.bool_]) -> Samples:
-    return Samples(*(column[selection] for column in samples))
+def _rows(samples: Samples, rows: Ints | NDArray[np.bool_]) -> Samples:
+    return Samples(samples.stamp_ns[rows], samples.kind[rows], samples.value[rows], samples.noise[rows])

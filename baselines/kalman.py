@@ -104,7 +104,9 @@ def is_far(cov: Floats, G_z: Floats, range_m: float, R_z: Floats) -> bool:
     across = G_z[:, 1].copy()  # of length r
     A = along @ cov @ along
     L = across @ cov @ across / range_m**2
-    return 2.0 * range_m * math.sqrt(R_z[0, 0]) < L or range_m**4 * R_z[1, 1] < L * A
+    is_bent = 2.0 * range_m * math.sqrt(R_z[0, 0]) < L
+    is_turned = range_m**4 * R_z[1, 1] < L * A
+    return bool(is_bent or is_turned)
 
 
 def polar_covariance(R_z: Floats, aperture_rad: float) -> Floats:

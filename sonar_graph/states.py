@@ -218,7 +218,6 @@ class Outcome(StrEnum):
     USED_LATER = "used later, when its identity was known"
     PLACED_LATER = "used later, when its landmark, of unknown identity, had been seen often enough"
     MOVED = "used: taken back from one landmark and given to another"
-    LET_IN = "used: outside the gate, but so were most of the last ones"
     GATED = "refused: innovation outside the gate"
     REASSIGNED = "used: its place says that it is another landmark"
     UNFIT = "refused: its place fits no landmark that it may be"

@@ -43,8 +43,7 @@ for variable in THREAD_VARIABLES:
 import filterpy_ekf
 import numpy as np
 
-from baselines.ekf_equations import COMPASS
-from baselines.ekf_slam import EkfSlam
+from baselines.ekf_slam import COMPASS, EkfSlam
 from baselines.invariant_ekf import InvariantEkf
 from sonar_graph.measurements import NS_PER_S, Floats, Measurements
 from sonar_graph.navigation import Odometry

@@ -2,10 +2,10 @@
 
 Kernel: `invariant-ekf` with a Cauchy kernel of width 1.5 and without, `ekf-slam` for comparison, at shares of wrong
 identities. Each detection's identity is replaced with that probability by one drawn evenly from the others
-(`mrclam_wrong_ids.falsified`). Worlds are MRCLAM 2, 4, 6 and 9 (robots real, landmarks known), DLR (its reference is the
-map of iSAM2 with right identities) and A-KIT with far landmarks simulated along its reference. The figure is the
-horizontal rms of the map after the best SE(2) alignment, mean over the runs of a world, with the worst in brackets;
-A-KIT and MRCLAM 6 have the causal trajectory besides. A run is lost where the map is more than `LOST_M` off, or it fails.
+(`mrclam_wrong_ids.falsified`). Worlds are MRCLAM 2, 4, 6 and 9 (robots real, landmarks known), DLR (its reference is
+the map of iSAM2 with right identities) and A-KIT with far landmarks simulated along its reference. Figures are the
+horizontal rms of the map and of the causal trajectory after the best SE(2) alignment, means over the runs of a world. A
+run is lost where the map is more than `LOST_M` off, or it fails; ``warned`` counts runs with a message of a lock-out.
 
 Far views: short missions that lose bottom lock for 60 and 120 s, both filters with `far_views` and without; NEES of
 position over 3 and error (m, rms) so many seconds after the gap.

@@ -27,9 +27,9 @@ from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
+from baselines.invariant_equations import InvariantState
 from common import conclude, in_parallel, make_parser, note, print_table
 
-from baselines.invariant_equations import InvariantState
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting, Start
 from sonar_graph.evaluation import compare
 from sonar_graph.measurements import Dvl, Imu

@@ -40,7 +40,7 @@ ESTIMATES: dict[str, str] = {
     "smoothed": "Smoothed estimate (what is known at the end about each instant)",
 }
 USED = {
-    *(Outcome.USED, Outcome.NEW, Outcome.LET_IN, Outcome.USED_LATER),
+    *(Outcome.USED, Outcome.NEW, Outcome.USED_LATER),
     *(Outcome.PLACED_LATER, Outcome.MOVED, Outcome.REASSIGNED),
 }
 """Outcomes of detections that are in the estimate."""

@@ -4,7 +4,7 @@ sonar.py       range and azimuth of a landmark, and the inverse
 aiding.py      headings and position fixes, with Huber's kernel
 biases.py      biases that last through a run, and what they do to a motion
 kernels.py     robust kernels of range and azimuth
-identity.py    acceptance of a recogniser's identities, and the gate
+identity.py    acceptance of a recogniser's identities
 """
 
 # fmt: off
@@ -12,13 +12,14 @@ from sonar_graph.models.aiding import HUBER_WIDTHS, Contradictions, huber_scale,
 from sonar_graph.models.biases import (
     ACCEL, BIASES, COMPASS, HEADING, SCALE, TILT, bias_jacobian, bias_sigmas, by_biases, gyro_bias_of,
 )
-from sonar_graph.models.identity import ACCEPTED, MINIMUM_PROBABILITY, gate_threshold, identify
+from sonar_graph.models.identity import ACCEPTED, MINIMUM_PROBABILITY, identify
 from sonar_graph.models.kernels import GaussianKernel, Kernel, KernelParams, Robust, RobustKernel
 from sonar_graph.models.sonar import (
     FLOOR_GATE, Mount, body_point_jacobian, elevation_on_floor, floor_elevation, locate, locate_from_body,
     locate_jacobians, project, project_points, range_azimuth, range_azimuth_jacobians, sonar_point,
     sonar_point_jacobian, view_from_body, view_points, wrap_angle,
 )
+from sonar_graph.numerics import gate_threshold
 
 __all__ = [
     "ACCEL", "ACCEPTED", "BIASES", "COMPASS", "Contradictions", "FLOOR_GATE", "GaussianKernel", "HEADING",

@@ -1,12 +1,10 @@
-"""Identities as a recogniser states them, accepted where their posterior is high enough, and the gate's threshold."""
-
-from functools import cache
+"""Identities as a recogniser states them, accepted where their posterior is high enough."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sonar_graph.measurements import Floats, Ints, LandmarkDetections
-from sonar_graph.numerics import chi_square_quantile, compiled
+from sonar_graph.numerics import compiled
 from sonar_graph.states import OUTCOME_NUMBERS, Outcome
 
 ACCEPTED = -1
@@ -49,9 +47,3 @@ def _write_identities(
             if ids[other] == ids[row] and outcomes[other] == ACCEPTED and outcomes[row] == ACCEPTED:
                 outcomes[row if p[row] <= p[other] else other] = REPEATED
             other -= 1
-
-
-@cache
-def gate_threshold(probability: float, dof: int) -> float:
-    """Squared Mahalanobis distance that a true innovation of ``dof`` components stays below with this probability."""
-    return chi_square_quantile(probability, dof)

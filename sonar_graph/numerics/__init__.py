@@ -1,21 +1,20 @@
 """Compiled functions, and rotations, vectors and matrices inside them; quantiles of chi-square."""
 
 # fmt: off
-from sonar_graph.numerics.chi_square import chi_square_exceeded, chi_square_quantile, chi_square_share
+from sonar_graph.numerics.chi_square import chi_square_exceeded, chi_square_quantile, chi_square_share, gate_threshold
 from sonar_graph.numerics.compiling import compiling_s
 from sonar_graph.numerics.jit import compiled, inlined
 from sonar_graph.numerics.matrices import (
-    I3, LOWER_LEFT, LOWER_RIGHT, O3, UPPER_RIGHT, ZERO, Mat3, Mat6, Vec3, Vec6, body_rates_from_euler, chord_inverse,
-    cross, curvature, diagonal, euler_from_rotation, euler_rates_from_body, exp_and_mean, mat, mat6, outer, quaternion,
-    rodrigues, rotation_from_euler, rotation_log, skew, store, store6, vec,
+    I3, LOWER_LEFT, LOWER_RIGHT, O3, UPPER_RIGHT, ZERO, Mat3, Mat6, Vec3, Vec6, chord_inverse,
+    cross, curvature, diagonal, exp_and_mean, mat, mat6, outer, quaternion,
+    rodrigues, rotation_log, skew, store, store6, vec,
 )
 from sonar_graph.numerics.rotations import cross_matrix, left_jacobian, rotation_exp, running_rotations
 
 __all__ = [
     "I3", "LOWER_LEFT", "LOWER_RIGHT", "Mat3", "Mat6", "O3", "UPPER_RIGHT", "Vec3", "Vec6", "ZERO",
-    "body_rates_from_euler", "chi_square_share", "chi_square_quantile", "chi_square_exceeded", "chord_inverse",
-    "compiled", "compiling_s", "cross", "cross_matrix", "curvature", "diagonal", "euler_from_rotation",
-    "euler_rates_from_body", "exp_and_mean", "inlined", "left_jacobian", "mat", "mat6", "outer", "quaternion",
-    "rodrigues", "rotation_exp", "rotation_from_euler", "rotation_log", "running_rotations", "skew", "store", "store6",
-    "vec",
+    "chi_square_exceeded", "chi_square_quantile", "chi_square_share", "chord_inverse", "compiled", "compiling_s",
+    "cross", "cross_matrix", "curvature", "diagonal", "exp_and_mean", "gate_threshold", "inlined", "left_jacobian",
+    "mat", "mat6", "outer", "quaternion", "rodrigues", "rotation_exp", "rotation_log", "running_rotations", "skew",
+    "store", "store6", "vec",
 ]

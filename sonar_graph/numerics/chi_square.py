@@ -1,5 +1,7 @@
 """The chi-square distribution, digit for digit that of scipy.stats, which takes a second to load."""
 
+from functools import cache
+
 import numpy as np
 from scipy.special import chdtr, chdtri, gammaincinv
 
@@ -26,3 +28,9 @@ def chi_square_exceeded(probability: float, dof: float) -> float:
 def chi_square_share(values: Floats, dof: float) -> Floats:
     """Probability that it stays below each of the values, of the same shape."""
     return np.asarray(chdtr(dof, values), np.float64)
+
+
+@cache
+def gate_threshold(probability: float, dof: int) -> float:
+    """Squared Mahalanobis distance that a true innovation of ``dof`` components stays below with this probability."""
+    return chi_square_quantile(probability, dof)

@@ -2,8 +2,7 @@
 
 They are tuples. Inside a compiled function they live in registers, where an array of nine numbers is an allocation that
 costs as much as a product; outside, the same operators are ordinary methods. Rotations follow Forster et al.,
-"On-Manifold Preintegration", IEEE TRO 33(1), 2017, (3), (8); Euler angles, roll, pitch and yaw (phi, theta, psi),
-Fossen, "Handbook of Marine Craft Hydrodynamics and Motion Control", 2011, (2.18), (2.28).
+"On-Manifold Preintegration", IEEE TRO 33(1), 2017, (3), (8).
 """
 
 import itertools
@@ -258,36 +257,3 @@ def chord_inverse(theta: Vec3) -> Mat3:
     """``J_l(theta)^-1 = I - [theta]x / 2 + a [theta]x^2``, a as in `curvature`; its transpose is that of Log."""
     x = theta @ theta
     return rodrigues(theta, x, -0.5, curvature(x)[0])
-
-
-@inlined
-def rotation_from_euler(angles: Vec3) -> Mat3:
-    """``world_R_body = Rz(psi) Ry(theta) Rx(phi)`` from (phi, theta, psi), rad."""
-    c_r, s_r = math.cos(angles.x), math.sin(angles.x)
-    c_p, s_p = math.cos(angles.y), math.sin(angles.y)
-    c_y, s_y = math.cos(angles.z), math.sin(angles.z)
-    return Mat3(
-        Vec3(c_y * c_p, c_y * s_p * s_r - s_y * c_r, c_y * s_p * c_r + s_y * s_r),
-        Vec3(s_y * c_p, s_y * s_p * s_r + c_y * c_r, s_y * s_p * c_r - c_y * s_r),
-        Vec3(-s_p, c_p * s_r, c_p * c_r),
-    )
-
-
-@inlined
-def euler_from_rotation(R: Mat3) -> Vec3:
-    """(phi, theta, psi), rad; phi and psi in (-pi, pi], theta in [-pi/2, pi/2]."""
-    return Vec3(math.atan2(R.z.y, R.z.z), math.atan2(-R.z.x, math.hypot(R.z.y, R.z.z)), math.atan2(R.y.x, R.x.x))
-
-
-@inlined
-def body_rates_from_euler(angles: Vec3) -> Mat3:
-    """W: body rates are ``w = W (phi', theta', psi')^T``."""
-    c_r, s_r, c_p, s_p = math.cos(angles.x), math.sin(angles.x), math.cos(angles.y), math.sin(angles.y)
-    return Mat3(Vec3(1.0, 0.0, -s_p), Vec3(0.0, c_r, s_r * c_p), Vec3(0.0, -s_r, c_r * c_p))
-
-
-@inlined
-def euler_rates_from_body(angles: Vec3) -> Mat3:
-    """``E = W^-1``, infinite at theta = ±90°; ``world_R_body Exp(delta)`` has angles that differ by ``E delta``."""
-    c_r, s_r, c_p, t_p = math.cos(angles.x), math.sin(angles.x), math.cos(angles.y), math.tan(angles.y)
-    return Mat3(Vec3(1.0, s_r * t_p, c_r * t_p), Vec3(0.0, c_r, -s_r), Vec3(0.0, s_r / c_p, c_r / c_p))
