@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -45,28 +45,27 @@ class JointCovariance:
 class KeptCovariance:
     """One joint covariance for all questions between two updates.
 
-    It also covers what was asked for before the last update, since successive frames show mostly the same landmarks.
+    A question costs an elimination of most of the map, whatever it asks for. So the first question after an update also
+    asks for the landmarks that the next frame is likely to show.
     """
 
     def __init__(self) -> None:
         self._joint: JointCovariance | None = None
         self._asked: set[int] = set()
-        self._asked_before: set[int] = set()
 
-    def of(self, marginals: Marginals | gtsam.ISAM2, keys: list[int]) -> JointCovariance:
-        """Joint covariance of these variables, and possibly of more."""
+    def of(
+        self, marginals: Marginals | gtsam.ISAM2, keys: list[int], likely: Callable[[], list[int]]
+    ) -> JointCovariance:
+        """Joint covariance of these variables, and possibly of more; ``likely`` names those asked for next."""
         self._asked.update(keys)
         if self._joint is None or not self._joint.rows.keys() >= self._asked:
-            self._joint = JointCovariance.of(marginals, sorted(self._asked | self._asked_before))
+            self._joint = JointCovariance.of(marginals, sorted(self._asked.union(likely())))
         return self._joint
 
-    def outdate(self) -> None:
-        """The same graph is linearised elsewhere."""
+    def renew(self) -> None:
+        """The graph has changed."""
         self._joint = None
-
-    def renew(self, lasting: Iterable[int]) -> None:
-        """The graph has changed; of what was asked for only some variables last."""
-        self._joint, self._asked, self._asked_before = None, set(), self._asked.intersection(lasting)
+        self._asked = set()
 
 
 class Marginals:

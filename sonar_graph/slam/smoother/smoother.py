@@ -41,6 +41,8 @@ MOST_STEPS = 4
 """Further Gauss-Newton steps in an update, at most: each costs as much as an update."""
 MOST_SETTLING_STEPS = 10
 """The same after an exchange of factors, which may move the estimate far."""
+REACH = 1.5
+"""Distance of landmarks, in longest ranges, up to which the next frame may show them: the vehicle has moved by then."""
 ROUNDING_S = 1e-6
 """Margin for rounded times: a variable exactly as old as the lag stays."""
 
@@ -161,6 +163,10 @@ class Estimates:
             return True
         return self._window is not None and key not in self._gone and self._window.holds(key)
 
+    def is_taken_up(self, key: int) -> bool:
+        """True for a variable that is in the window, not only about to be."""
+        return self.exists(key) and not self.new.exists(key)
+
     def atPose3(self, key: int) -> gtsam.Pose3:
         """Pose of a keyframe; the name is GTSAM's."""
         return self._at(key)
@@ -227,6 +233,7 @@ class Smoother:
         self._store = FactorStore()
         self._is_by_qr = False
         self._waiting_gain = 0.0
+        self._longest_range_m = 0.0
         self._removed: list[int] = []
         self._newest_s = -np.inf
         self._relinearised_s = -np.inf
@@ -319,6 +326,8 @@ class Smoother:
         """
         self._waiting_gain += gain
         self._solved = None
+        if seen is not None:
+            self._longest_range_m = max(self._longest_range_m, float(seen[1].z[0]))
         return self._store.add(FactorGroup(factors, seen))
 
     def hold(self, until_s: dict[int, float]) -> None:
@@ -454,7 +463,7 @@ class Smoother:
         self._removed = []
         self._waiting_gain = 0.0
         self.estimates.renew(self._window)
-        self._kept_covariance.renew(self._landmarks)
+        self._kept_covariance.renew()
         if isinstance(self._window, FixedLagWindow):
             self._leave(self._window)
 
@@ -598,7 +607,18 @@ class Smoother:
 
     def joint_covariance(self, keys: list[int]) -> JointCovariance:
         """Joint marginal covariance of variables in the window, and possibly of more of them."""
-        return self._kept_covariance.of(self.marginals, keys)
+        return self._kept_covariance.of(self.marginals, keys, self._landmarks_in_reach)
+
+    def _landmarks_in_reach(self) -> list[int]:
+        """Landmarks within `REACH` times the longest range measured so far from the newest keyframe."""
+        if self._newest_pose is None or not self._landmarks:
+            return []
+        known = [key for key in self._landmarks if self.estimates.is_taken_up(key)]
+        reach_m = REACH * self._longest_range_m
+        position_m = self.estimates.atPose3(self._newest_pose).translation()
+        points_m = np.array([self.estimates.atPoint3(key) for key in known]).reshape(-1, 3)
+        distances_m = np.linalg.norm(points_m - position_m, axis=1)
+        return [key for key, distance_m in zip(known, distances_m, strict=True) if distance_m <= reach_m]
 
     def joint_covariance_of_any(self, keys: list[int]) -> JointCovariance:
         """Joint marginal covariance of any variables, from the batch solution if one has left the window."""
