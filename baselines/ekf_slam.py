@@ -28,20 +28,17 @@ from baselines.filter import FilterParams, FilterShell
 from baselines.kalman import (
     GATED,
     Judged,
-    bordered,
     correction,
     distance,
-    far_covariance,
-    is_far,
     judged,
     judged_far,
     polar_covariance,
+    stands_on_floor,
     symmetric,
 )
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
 from sonar_graph.measurements import Floats
 from sonar_graph.models import (
-    FLOOR_GATE,
     body_point_jacobian,
     huber_scale,
     locate_from_body,
@@ -163,25 +160,6 @@ def observe(
     return outcome, e, S
 
 
-def observe_far(x: Floats, P: Floats, at: int, motion: Motion, sonar: Sonar, z: Floats, R_z: Floats) -> Judged | None:
-    """Update as `observe` by a landmark far from where it is predicted, ``0 = g(x_v, z) - p``; None if it is near."""
-    R, X, T = pose_after(x, motion)
-    g, G_b, G_z = locate_from_body(R, X, sonar.mount, z, 0.0)
-    e = g - x[at : at + LANDMARK]
-    H = np.zeros((LANDMARK, len(x)))
-    H[:, :POSE] = -G_b @ T
-    H[:, at : at + LANDMARK] = np.eye(3)
-    noise = G_b @ motion.C @ G_b.T
-    S = H @ P @ H.T + noise
-    if not is_far(S, G_z, z[0], R_z):
-        return None
-    V = G_z @ far_covariance(R_z, z[0], sonar.aperture_rad) @ G_z.T
-    outcome, e_z, S_z, widened = judged_far(e, symmetric(S + V), G_z, R_z, sonar.gate, sonar.kernel_width)
-    if outcome != GATED:
-        update(x, P, H, e, symmetric(noise + V + widened))
-    return Judged(outcome, e_z, symmetric(S_z))
-
-
 @compiled
 def update_depth(x: Floats, P: Floats, motion: Motion, port: Floats, z_m: float, variance_m2: float) -> None:
     """Update by the height of the pressure port, ``(X' + R' q)_z``."""
@@ -191,86 +169,6 @@ def update_depth(x: Floats, P: Floats, motion: Motion, port: Floats, z_m: float,
     H[:, :POSE] = H_b @ T
     e = z_m - (X + R @ port)[2:]
     update(x, P, H, e, H_b @ motion.C @ H_b.T + variance_m2)
-
-
-def update_heading(
-    x: Floats, P: Floats, motion: Motion, yaw_rad: float, variance_rad2: float, bias_variance_rad2: float
-) -> float:
-    """Update by a compass, ``psi' + c``, with Huber's kernel.
-
-    Returns the distance from the yaw in sigmas, in which the bias of the compass counts as noise.
-    """
-    R, _, T = pose_after(x, motion)
-    yaw, by_turn = yaw_and_derivative(R)
-    H_b = np.zeros((1, 6))
-    H_b[0, :3] = by_turn
-    H = np.zeros((1, len(x)))
-    H[:, :POSE] = H_b @ T
-    noise = H_b @ motion.C @ H_b.T
-    off = distance(np.array([wrap_angle(yaw_rad - yaw)]), H @ P @ H.T + noise + variance_rad2 + bias_variance_rad2)
-    H[0, COMPASS] = 1.0
-    e = np.array([wrap_angle(yaw_rad - yaw - x[COMPASS])])
-    scale = huber_scale(e, H @ P @ H.T + noise + variance_rad2)
-    update(x, P, H, e, noise + scale * variance_rad2)
-    return off
-
-
-def update_position(x: Floats, P: Floats, motion: Motion, q: Floats, position_m: Floats, R_z: Floats) -> float:
-    """Update by the position of a point q of the body, ``X' + R' q``, with Huber's kernel; the distance in sigmas."""
-    R, X, T = pose_after(x, motion)
-    H_b = body_point_jacobian(R, q)  # (3, 6)
-    H = np.zeros((3, len(x)))
-    H[:, :POSE] = H_b @ T
-    e = position_m - (X + R @ q)
-    noise = H_b @ motion.C @ H_b.T
-    S = symmetric(H @ P @ H.T + noise + R_z)
-    update(x, P, H, e, noise + huber_scale(e, S) * R_z)
-    return distance(e, S)
-
-
-def update_up(x: Floats, P: Floats, up: Floats, sigma_rad: float) -> None:
-    """Update roll and pitch by the direction of the world's up in the body, with the sigma of its tilt."""
-    level = math.hypot(up[1], up[2])
-    H = np.zeros((2, len(x)))
-    H[0, ROLL] = 1.0
-    H[1, PITCH] = 1.0
-    e = np.array([wrap_angle(math.atan2(up[1], up[2]) - x[ROLL]), math.atan2(-up[0], level) - x[PITCH]])
-    update(x, P, H, e, np.diag(np.array([(sigma_rad / level) ** 2, sigma_rad**2])))
-
-
-def update_plane(x: Floats, P: Floats, plane: PlanarMotion) -> None:
-    """Update Z, roll and pitch by the plane on which the vehicle stays."""
-    H = np.zeros((3, len(x)))
-    H[0, Z] = 1.0
-    H[1, ROLL] = 1.0
-    H[2, PITCH] = 1.0
-    e = np.array([plane.z_m - x[Z], -x[ROLL], -x[PITCH]])
-    update(x, P, H, e, np.diag(np.square([plane.z_sigma_m, plane.tilt_sigma_rad, plane.tilt_sigma_rad])))
-
-
-# -------------------------------------------------------------------------------- augmentation
-
-
-def augment(x: Floats, P: Floats, motion: Motion, sonar: Sonar, z: Floats, R_z: Floats) -> tuple[Floats, Floats]:
-    """State and covariance with a new landmark ``p = g(x_v, z, elevation)``, on a floor of known height if it is near.
-
-    ``P_pv = G_v P_v.``,  ``P_pp = G_v P_vv G_v^T + G_b C G_b^T + G_z diag(R_z, elevation_sigma^2) G_z^T``.
-    """
-    R, X, T = pose_after(x, motion)
-    p, G_b, G_z = locate_from_body(R, X, sonar.mount, z, elevation_of_new(R, X, sonar, z))
-    G_v = G_b @ T
-    P_pv = G_v @ P[:POSE]  # (3, n)
-    P_pp = P_pv[:, :POSE].copy() @ G_v.T + G_b @ motion.C @ G_b.T
-    P_pp += G_z @ polar_covariance(R_z, sonar.aperture_rad) @ G_z.T
-    n = len(x)
-    x = np.concatenate((x, p))
-    P = bordered(P, P_pv, symmetric(P_pp))
-    H = np.zeros((1, n + LANDMARK))
-    H[0, -1] = 1.0
-    e = np.array([sonar.floor_z_m - x[-1]])  # NaN where the floor is not known
-    if e[0] ** 2 <= FLOOR_GATE * (P[-1, -1] + sonar.floor_variance_m2):
-        update(x, P, H, e, np.array([[sonar.floor_variance_m2]]))
-    return x, P
 
 
 class EkfSlamParams(FilterParams):
@@ -334,33 +232,93 @@ class EkfSlam(FilterShell):
         return Judged(*observe(self._x, self._P, MAP + LANDMARK * slot, motion, self.sonar, z, R_z))
 
     def observe_far(self, motion: Motion, slot: int, z: Floats, R_z: Floats) -> Judged | None:
-        """Update by a landmark that may be far from where it is predicted."""
-        return observe_far(self._x, self._P, MAP + LANDMARK * slot, motion, self.sonar, z, R_z)
+        """Update by a landmark far from where it is predicted, ``0 = g(x_v, z) - p``; None if it is near."""
+        x = self._x
+        P = self._P
+        sonar = self.sonar
+        at = MAP + LANDMARK * slot
+        R, X, T = pose_after(x, motion)
+        g, G_b, G_z = locate_from_body(R, X, sonar.mount, z, 0.0)
+        e = g - x[at : at + LANDMARK]
+        H = np.zeros((LANDMARK, len(x)))
+        H[:, :POSE] = -G_b @ T
+        H[:, at : at + LANDMARK] = np.eye(3)
+        told, R_g = judged_far(e, H @ P @ H.T, G_b @ motion.C @ G_b.T, G_z, sonar, z, R_z)
+        if told is not None and told.outcome != GATED:
+            update(x, P, H, e, R_g)
+        return told
 
     def augment(self, motion: Motion, z: Floats, R_z: Floats) -> None:
-        """Append a landmark to (4) and (5)."""
-        self._x, self._P = augment(self._x, self._P, motion, self.sonar, z, R_z)
+        """Append a landmark ``p = g(x_v, z, elevation)`` to (4) and (5), on a floor of known height if it is near.
+
+        ``P_pv = G_v P_v.``,  ``P_pp = G_v P_vv G_v^T + G_b C G_b^T + G_z diag(R_z, elevation_sigma^2) G_z^T``.
+        """
+        x = self._x
+        P = self._P
+        sonar = self.sonar
+        R, X, T = pose_after(x, motion)
+        p, G_b, G_z = locate_from_body(R, X, sonar.mount, z, elevation_of_new(R, X, sonar, z))
+        G_v = G_b @ T
+        P_pv = G_v @ P[:POSE]  # (3, n)
+        P_pp = P_pv[:, :POSE] @ G_v.T + G_b @ motion.C @ G_b.T
+        P_pp += G_z @ polar_covariance(R_z, sonar.aperture_rad) @ G_z.T
+        self._x = np.concatenate((x, p))
+        self._P = np.block([[P, P_pv.T], [P_pv, symmetric(P_pp)]])
+        if stands_on_floor(p[2], P_pp[2, 2], sonar):
+            self._update_numbers([len(x) + 2], np.array([sonar.floor_z_m - p[2]]), [sonar.floor_variance_m2])
 
     def update_depth(self, motion: Motion, z_m: float, variance_m2: float) -> None:
         """Update by the height of the pressure port."""
         update_depth(self._x, self._P, motion, self.port, z_m, variance_m2)
 
     def update_heading(self, motion: Motion, yaw_rad: float, variance_rad2: float) -> float:
-        """Update by the yaw of the body and the compass' bias."""
-        bias_variance_rad2 = self.calibration.heading.bias_sigma_rad**2
-        return update_heading(self._x, self._P, motion, yaw_rad, variance_rad2, bias_variance_rad2)
+        """Update by a compass, ``psi' + c``, with Huber's kernel."""
+        x = self._x
+        P = self._P
+        R, _, T = pose_after(x, motion)
+        yaw, by_turn = yaw_and_derivative(R)
+        H_b = np.array([[*by_turn, 0.0, 0.0, 0.0]])
+        H = np.zeros((1, len(x)))
+        H[:, :POSE] = H_b @ T
+        noise = H_b @ motion.C @ H_b.T
+        e = np.array([wrap_angle(yaw_rad - yaw)])
+        off = distance(e, H @ P @ H.T + noise + variance_rad2 + self.compass_variance_rad2)
+        H[0, COMPASS] = 1.0
+        e = wrap_angle(e - x[COMPASS])
+        scale = huber_scale(e, H @ P @ H.T + noise + variance_rad2)
+        update(x, P, H, e, noise + scale * variance_rad2)
+        return off
 
     def update_position(self, motion: Motion, position_m: Floats, cov_m2: Floats) -> float:
-        """Update by the position of the antenna."""
-        return update_position(self._x, self._P, motion, self.antenna, position_m, cov_m2)
+        """Update by the position of the antenna, ``X' + R' q``, with Huber's kernel."""
+        x = self._x
+        P = self._P
+        R, X, T = pose_after(x, motion)
+        H_b = body_point_jacobian(R, self.antenna)  # (3, 6)
+        H = np.zeros((3, len(x)))
+        H[:, :POSE] = H_b @ T
+        e = position_m - (X + R @ self.antenna)
+        noise = H_b @ motion.C @ H_b.T
+        S = symmetric(H @ P @ H.T + noise + cov_m2)
+        update(x, P, H, e, noise + huber_scale(e, S) * cov_m2)
+        return distance(e, S)
 
     def update_up(self, up: Floats, sigma_rad: float, i_R_j: Floats) -> None:  # noqa: ARG002  # (4) has no bias
-        """Update roll and pitch by the direction of the world's up."""
-        update_up(self._x, self._P, up, sigma_rad)
+        """Update roll and pitch by the direction of the world's up in the body."""
+        level = math.hypot(up[1], up[2])
+        roll_off = wrap_angle(math.atan2(up[1], up[2]) - self._x[ROLL])
+        e = np.array([roll_off, math.atan2(-up[0], level) - self._x[PITCH]])
+        self._update_numbers([ROLL, PITCH], e, [(sigma_rad / level) ** 2, sigma_rad**2])
 
     def update_plane(self, plane: PlanarMotion) -> None:
         """Update Z, roll and pitch by the plane on which the vehicle stays."""
-        update_plane(self._x, self._P, plane)
+        e = np.array([plane.z_m, 0.0, 0.0]) - self._x[[Z, ROLL, PITCH]]
+        tilt_variance = plane.tilt_sigma_rad**2
+        self._update_numbers([Z, ROLL, PITCH], e, [plane.z_sigma_m**2, tilt_variance, tilt_variance])
+
+    def _update_numbers(self, places: list[int], e: Floats, variances: list[float]) -> None:
+        """Update by direct measurements of numbers of the state."""
+        update(self._x, self._P, np.eye(len(self._x))[places], e, np.diag(variances))
 
     def pose_after(self, motion: Motion) -> tuple[Floats, Floats, Floats]:
         """world_R_body (3, 3), position (3,), and covariance of [theta, rho] (6, 6) a motion after the state."""

@@ -136,6 +136,8 @@ class FilterShell(ABC):
         self.sonar = sonar_of(calibration, params)
         self.port = np.array(calibration.depth.port_m)
         self.antenna = np.array(calibration.positions.antenna_m)
+        self.compass_variance_rad2 = calibration.heading.bias_sigma_rad**2
+        """Of the constant bias of the compass, at the start."""
         self.node_ns = 0
         """Stamp of the newest epoch, that of the state."""
         sonar = calibration.sonar
@@ -186,7 +188,10 @@ class FilterShell(ABC):
 
     @abstractmethod
     def update_heading(self, motion: Motion, yaw_rad: float, variance_rad2: float) -> float:
-        """Update by the yaw of the body and the compass' bias, a motion after the state; its distance in sigmas."""
+        """Update by the yaw of the body and the compass' bias, a motion after the state.
+
+        Returns its distance from the yaw in sigmas, in which the bias of the compass counts as noise.
+        """
 
     @abstractmethod
     def update_position(self, motion: Motion, position_m: Floats, cov_m2: Floats) -> float:
@@ -361,8 +366,9 @@ class FilterShell(ABC):
         value = np.zeros((len(heading), 3))
         noise = np.zeros((len(heading), 3, 3))
         value[:, 0] = heading.yaw_rad
-        sigma_rad = heading.sigma_rad
-        noise[:, 0, 0] = np.where(np.isnan(sigma_rad), self.calibration.heading.sigma_rad, sigma_rad) ** 2
+        sigma_rad = np.where(np.isnan(heading.sigma_rad), self.calibration.heading.sigma_rad, heading.sigma_rad)
+        with np.errstate(over="ignore"):  # of an unsound row, which is refused
+            noise[:, 0, 0] = np.square(sigma_rad)
         return _samples(heading.stamps_ns, HEADING, value, noise)
 
     def _fixes(self, fixes: PositionFixes) -> Samples:

@@ -52,14 +52,12 @@ from baselines.filter import FilterParams, FilterShell
 from baselines.kalman import (
     GATED,
     Judged,
-    bordered,
     correction,
     distance,
-    far_covariance,
-    is_far,
     judged,
     judged_far,
     polar_covariance,
+    stands_on_floor,
     symmetric,
 )
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
@@ -68,7 +66,6 @@ from sonar_graph.models import (
     ACCEL,
     BIASES,
     COMPASS,
-    FLOOR_GATE,
     SCALE,
     bias_jacobian,
     bias_sigmas,
@@ -190,30 +187,6 @@ def observe(
     return outcome, e, S
 
 
-def observe_far(state: InvariantState, k: int, motion: Motion, sonar: Sonar, z: Floats, R_z: Floats) -> Judged | None:
-    """Update as `observe` by a landmark far from where it is predicted, by the point seen, (6); None if it is near.
-
-    Exp(theta) turns both points: the innovation is ``xi_k - xi_new``, without theta however far they are apart.
-    """
-    at = BODY.start + POINT * k
-    R, X, D = pose_after(state, motion)
-    g, G_b, G_z = locate_from_body(R, X, sonar.mount, z, 0.0)
-    e = g - state.points[k]
-    H = np.zeros((POINT, len(state.P)))
-    H[:, at : at + POINT] = np.eye(3)
-    H[:, BODY] = -np.eye(3)
-    H[:, BETA] = -G_b @ D  # (4)
-    noise = G_b @ motion.C @ G_b.T
-    S = H @ state.P @ H.T + noise
-    if not is_far(S, G_z, z[0], R_z):
-        return None
-    V = G_z @ far_covariance(R_z, z[0], sonar.aperture_rad) @ G_z.T
-    outcome, e_z, S_z, widened = judged_far(e, symmetric(S + V), G_z, R_z, sonar.gate, sonar.kernel_width)
-    if outcome != GATED:
-        update(state, H, e, symmetric(noise + V + widened))
-    return Judged(outcome, e_z, symmetric(S_z))
-
-
 @compiled
 def position_jacobian(state: InvariantState, a: Floats, H_b: Floats, D: Floats) -> Floats:
     """H of the position a of a point of the body, (7), shape (3, 17 + 3 N)."""
@@ -235,98 +208,13 @@ def update_depth(state: InvariantState, motion: Motion, port: Floats, z_m: float
     update(state, H, z_m - a[2:], H_b @ motion.C @ H_b.T + variance_m2)
 
 
-def update_heading(
-    state: InvariantState, motion: Motion, yaw_rad: float, variance_rad2: float, bias_variance_rad2: float
-) -> float:
-    """Update by a compass, (10), with Huber's kernel.
-
-    Returns the distance from the yaw in sigmas, in which the bias of the compass counts as noise.
-    """
-    R, _, D = pose_after(state, motion)
-    yaw, by_turn = yaw_and_derivative(R)
-    H_b = np.zeros((1, 6))
-    H_b[0, :3] = by_turn
-    H = np.zeros((1, len(state.P)))
-    H[0, THETA] = R @ by_turn
-    H[:, BETA] = H_b @ D  # (4)
-    noise = H_b @ motion.C @ H_b.T
-    S = H @ state.P @ H.T + noise + variance_rad2 + bias_variance_rad2
-    off = distance(np.array([wrap_angle(yaw_rad - yaw)]), S)
-    H[0, BETA_COMPASS] = 1.0
-    e = np.array([wrap_angle(yaw_rad - yaw - state.bias[COMPASS])])
-    scale = huber_scale(e, H @ state.P @ H.T + noise + variance_rad2)
-    update(state, H, e, noise + scale * variance_rad2)
-    return off
-
-
-def update_position(state: InvariantState, motion: Motion, q: Floats, position_m: Floats, R_z: Floats) -> float:
-    """Update by the position of a point q of the body, (7), with Huber's kernel; the distance in sigmas."""
-    R, X, D = pose_after(state, motion)
-    a = X + R @ q
-    H_b = body_point_jacobian(R, q)
-    H = position_jacobian(state, a, H_b, D)
-    e = position_m - a
-    noise = H_b @ motion.C @ H_b.T
-    S = symmetric(H @ state.P @ H.T + noise + R_z)  # (9)
-    update(state, H, e, noise + huber_scale(e, S) * R_z)
-    return distance(e, S)
-
-
-def update_up(state: InvariantState, up: Floats, by_accel: Floats, sigma_rad: float) -> None:
-    """Update by the direction of the world's up in the body, (8); ``by_accel``: A, shape (3, 3)."""
-    by_bias = state.R @ by_accel
-    y = state.R @ up - by_bias @ state.bias[ACCEL]
-    H = np.zeros((2, len(state.P)))
-    H[0, 1] = -1.0
-    H[1, 0] = 1.0
-    H[:, BETA_ACCEL] = by_bias[:2]
-    update(state, H, y[:2], sigma_rad**2 * np.eye(2))
-
-
-def height_jacobian(state: InvariantState, k: int) -> Floats:
-    """H of the height of x_k, (7), shape (1, 17 + 3 N)."""
-    H = np.zeros((1, len(state.P)))
-    H[0, 0] = state.points[k, 1]
-    H[0, 1] = -state.points[k, 0]
-    H[0, BODY.start + POINT * k + 2] = 1.0
-    return H
-
-
-def update_plane(state: InvariantState, plane: PlanarMotion) -> None:
-    """Update by the plane on which the vehicle stays: height of the body, (7), and tilt, (8)."""
-    e = plane.z_m - state.points[0, 2:]
-    update(state, height_jacobian(state, 0), e, np.array([[plane.z_sigma_m**2]]))
-    update_up(state, np.array([0.0, 0.0, 1.0]), np.zeros((3, 3)), plane.tilt_sigma_rad)
-
-
-# -------------------------------------------------------------------------------- augmentation
-
-
-def augment(state: InvariantState, motion: Motion, sonar: Sonar, z: Floats, R_z: Floats) -> InvariantState:
-    """State with a new landmark, (6), on a floor of known height if it is near."""
-    R, X, D = pose_after(state, motion)
-    g, G_b, G_z = locate_from_body(R, X, sonar.mount, z, elevation_of_new(R, X, sonar, z))
-    G = np.zeros((POINT, len(state.P)))
-    G[:, BODY] = np.eye(3)
-    G[:, BETA] = G_b @ D  # (4)
-    GP = G @ state.P
-    V = G_z @ polar_covariance(R_z, sonar.aperture_rad) @ G_z.T
-    P = bordered(state.P, GP, symmetric(GP @ G.T + G_b @ motion.C @ G_b.T + V))
-    state = state._replace(points=np.concatenate((state.points, g.reshape(1, 3))), P=P)
-    k = len(state.points) - 1
-    H = height_jacobian(state, k)
-    e = sonar.floor_z_m - state.points[k, 2:]  # NaN where the floor is not known
-    noise = sonar.floor_variance_m2 * np.eye(1)
-    if e[0] ** 2 <= FLOOR_GATE * (H @ P @ H.T + noise)[0, 0]:
-        update(state, H, e, noise)
-    return state
-
-
 class InvariantEkfParams(FilterParams):
     """Settings of the invariant filter: those of EKF-SLAM, with the smoother's kernel."""
 
     kernel_width: float = Field(1.5, ge=0)
     """As `FilterParams.kernel_width`; the smoother's default."""
+    far_views: bool = True
+    """As `FilterParams.far_views`."""
 
 
 class InvariantEkf(FilterShell):
@@ -383,35 +271,108 @@ class InvariantEkf(FilterShell):
         return Judged(*observe(self._state, 1 + slot, motion, self.sonar, z, R_z))
 
     def observe_far(self, motion: Motion, slot: int, z: Floats, R_z: Floats) -> Judged | None:
-        """Update by a landmark that may be far from where it is predicted, (6)."""
-        return observe_far(self._state, 1 + slot, motion, self.sonar, z, R_z)
+        """Update by a landmark far from where it is predicted, by the point seen, (6); None if it is near.
+
+        Exp(theta) turns both points: the innovation is ``xi_k - xi_new``, without theta however far they are apart.
+        """
+        state = self._state
+        sonar = self.sonar
+        R, X, D = pose_after(state, motion)
+        g, G_b, G_z = locate_from_body(R, X, sonar.mount, z, 0.0)
+        e = g - state.points[1 + slot]
+        H = np.zeros((POINT, len(state.P)))
+        H[:, place_of(1 + slot)] = np.eye(3)
+        H[:, BODY] = -np.eye(3)
+        H[:, BETA] = -G_b @ D  # (4)
+        told, R_g = judged_far(e, H @ state.P @ H.T, G_b @ motion.C @ G_b.T, G_z, sonar, z, R_z)
+        if told is not None and told.outcome != GATED:
+            update(state, H, e, R_g)
+        return told
 
     def augment(self, motion: Motion, z: Floats, R_z: Floats) -> None:
-        """Append a landmark, (6)."""
-        self._state = augment(self._state, motion, self.sonar, z, R_z)
+        """Append a landmark, (6), on a floor of known height if it is near."""
+        state = self._state
+        sonar = self.sonar
+        R, X, D = pose_after(state, motion)
+        g, G_b, G_z = locate_from_body(R, X, sonar.mount, z, elevation_of_new(R, X, sonar, z))
+        G = np.zeros((POINT, len(state.P)))
+        G[:, BODY] = np.eye(3)
+        G[:, BETA] = G_b @ D  # (4)
+        GP = G @ state.P
+        V = G_z @ polar_covariance(R_z, sonar.aperture_rad) @ G_z.T
+        own = symmetric(GP @ G.T + G_b @ motion.C @ G_b.T + V)
+        P = np.block([[state.P, GP.T], [GP, own]])
+        self._state = state._replace(points=np.vstack((state.points, g)), P=P)
+        k = len(state.points)
+        H = self._height_jacobian(k)
+        if stands_on_floor(g[2], (H @ P @ H.T)[0, 0], sonar):
+            update(self._state, H, sonar.floor_z_m - g[2:], np.array([[sonar.floor_variance_m2]]))
 
     def update_depth(self, motion: Motion, z_m: float, variance_m2: float) -> None:
         """Update by the height of the pressure port, (7)."""
         update_depth(self._state, motion, self.port, z_m, variance_m2)
 
     def update_heading(self, motion: Motion, yaw_rad: float, variance_rad2: float) -> float:
-        """Update by the yaw of the body and the compass' bias, (10)."""
-        bias_variance_rad2 = self.calibration.heading.bias_sigma_rad**2
-        return update_heading(self._state, motion, yaw_rad, variance_rad2, bias_variance_rad2)
+        """Update by a compass, (10), with Huber's kernel."""
+        state = self._state
+        R, _, D = pose_after(state, motion)
+        yaw, by_turn = yaw_and_derivative(R)
+        H_b = np.array([[*by_turn, 0.0, 0.0, 0.0]])
+        H = np.zeros((1, len(state.P)))
+        H[0, THETA] = R @ by_turn
+        H[:, BETA] = H_b @ D  # (4)
+        noise = H_b @ motion.C @ H_b.T
+        e = np.array([wrap_angle(yaw_rad - yaw)])
+        off = distance(e, H @ state.P @ H.T + noise + variance_rad2 + self.compass_variance_rad2)
+        H[0, BETA_COMPASS] = 1.0
+        e = wrap_angle(e - state.bias[COMPASS])
+        scale = huber_scale(e, H @ state.P @ H.T + noise + variance_rad2)
+        update(state, H, e, noise + scale * variance_rad2)
+        return off
 
     def update_position(self, motion: Motion, position_m: Floats, cov_m2: Floats) -> float:
-        """Update by the position of the antenna, (7)."""
-        return update_position(self._state, motion, self.antenna, position_m, cov_m2)
+        """Update by the position of the antenna, (7), with Huber's kernel."""
+        state = self._state
+        R, X, D = pose_after(state, motion)
+        a = X + R @ self.antenna
+        H_b = body_point_jacobian(R, self.antenna)
+        H = position_jacobian(state, a, H_b, D)
+        e = position_m - a
+        noise = H_b @ motion.C @ H_b.T
+        S = symmetric(H @ state.P @ H.T + noise + cov_m2)  # (9)
+        update(state, H, e, noise + huber_scale(e, S) * cov_m2)
+        return distance(e, S)
 
     def update_up(self, up: Floats, sigma_rad: float, i_R_j: Floats) -> None:
-        """Update by the direction of the world's up, (8)."""
+        """Update by the direction of the world's up in the body, (8)."""
         # the accelerometers' bias is constant in the body, which turns from i to j
         by_accel = 0.5 * (np.eye(3) + i_R_j.T) / self.calibration.gravity_m_s2
-        update_up(self._state, up, by_accel, sigma_rad)
+        self._update_tilt(up, by_accel, sigma_rad)
 
     def update_plane(self, plane: PlanarMotion) -> None:
-        """Update by the plane on which the vehicle stays, (7) and (8)."""
-        update_plane(self._state, plane)
+        """Update by the plane on which the vehicle stays: height of the body, (7), and tilt, (8)."""
+        e = plane.z_m - self._state.points[0, 2:]
+        update(self._state, self._height_jacobian(0), e, np.array([[plane.z_sigma_m**2]]))
+        self._update_tilt(np.array([0.0, 0.0, 1.0]), np.zeros((3, 3)), plane.tilt_sigma_rad)
+
+    def _update_tilt(self, up: Floats, by_accel: Floats, sigma_rad: float) -> None:
+        """Update by (8); ``by_accel``: A, shape (3, 3)."""
+        state = self._state
+        by_bias = state.R @ by_accel
+        y = state.R @ up - by_bias @ state.bias[ACCEL]
+        H = np.zeros((2, len(state.P)))
+        H[0, 1] = -1.0
+        H[1, 0] = 1.0
+        H[:, BETA_ACCEL] = by_bias[:2]
+        update(state, H, y[:2], sigma_rad**2 * np.eye(2))
+
+    def _height_jacobian(self, k: int) -> Floats:
+        """H of the height of x_k, (7), shape (1, 17 + 3 N)."""
+        x, y, _ = self._state.points[k]
+        H = np.zeros((1, len(self._state.P)))
+        H[0, THETA] = (y, -x, 0.0)
+        H[0, place_of(k)] = (0.0, 0.0, 1.0)
+        return H
 
     def attitude(self) -> Floats:
         """world_R_body of the state, shape (3, 3)."""

@@ -8,7 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from baselines.events import Sonar
 from sonar_graph.measurements import Floats
+from sonar_graph.models import FLOOR_GATE
 from sonar_graph.numerics import compiled
 from sonar_graph.states import OUTCOME_NUMBERS, Outcome
 
@@ -49,17 +51,6 @@ def correction(P: Floats, H: Floats, e: Floats, R: Floats) -> Floats:
 def symmetric(A: Floats) -> Floats:
     """``(A + A^T) / 2``."""
     return 0.5 * (A + A.T)
-
-
-def bordered(P: Floats, P_pv: Floats, P_pp: Floats) -> Floats:
-    """``[ P  P_pv^T ; P_pv  P_pp ]``."""
-    n = len(P)
-    whole = np.empty((n + len(P_pp), n + len(P_pp)))
-    whole[:n, :n] = P
-    whole[n:, :n] = P_pv
-    whole[:n, n:] = P_pv.T
-    whole[n:, n:] = P_pp
-    return whole
 
 
 @compiled
@@ -125,16 +116,33 @@ def far_covariance(R_z: Floats, range_m: float, aperture_rad: float) -> Floats:
 
 
 def judged_far(
-    e: Floats, S: Floats, G_z: Floats, R_z: Floats, gate: float, kernel_width: float
-) -> tuple[int, Floats, Floats, Floats]:
-    """`judged` for an innovation of a point, by its share along the beam and across it.
+    e: Floats, cov: Floats, noise: Floats, G_z: Floats, sonar: Sonar, z: Floats, R_z: Floats
+) -> tuple[Judged | None, Floats]:
+    """`judged` for an innovation of a point at elevation 0, by its share along the beam and across it.
 
-    Returns the outcome; the innovation of range and azimuth, shape (2,), and its covariance; and what the kernel adds
-    to the covariance of the point, shape (3, 3).
+    Parameters
+    ----------
+    e, cov, noise
+        Point seen less the landmark, shape (3,); its covariance by the state, and by the motion, shape (3, 3).
+    G_z
+        Derivative of the point seen by (range, azimuth, elevation), shape (3, 3).
+
+    Returns
+    -------
+    Outcome, innovation of range and azimuth and its covariance; None where `is_far` is false. Covariance of the noise
+    of the point with the kernel, shape (3, 3).
     """
-    beam = G_z[:, :2].copy()  # derivatives by range and azimuth, orthogonal
-    B = (beam / np.sum(beam * beam, axis=0)).T.copy()  # range and azimuth by the point
+    if not is_far(cov + noise, G_z, z[0], R_z):
+        return None, noise
+    noise = noise + G_z @ far_covariance(R_z, z[0], sonar.aperture_rad) @ G_z.T
+    beam = G_z[:, :2]  # derivatives by range and azimuth, orthogonal
+    B = np.ascontiguousarray((beam / np.sum(beam * beam, axis=0)).T)  # range and azimuth by the point
     e_z = B @ e
-    S_z = B @ S @ B.T
-    outcome, widened = judged(e_z, S_z, R_z, gate, kernel_width)
-    return outcome, e_z, S_z, beam @ widened @ beam.T
+    S_z = symmetric(B @ symmetric(cov + noise) @ B.T)
+    outcome, widened = judged(e_z, S_z, R_z, sonar.gate, sonar.kernel_width)
+    return Judged(outcome, e_z, S_z), symmetric(noise + beam @ widened @ beam.T)
+
+
+def stands_on_floor(z_m: float, variance_m2: float, sonar: Sonar) -> bool:
+    """Check that a new landmark's height is within the gate of a floor of known height."""
+    return bool((sonar.floor_z_m - z_m) ** 2 <= FLOOR_GATE * (variance_m2 + sonar.floor_variance_m2))

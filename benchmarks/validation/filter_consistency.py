@@ -17,7 +17,7 @@ it where an estimator claims too much. Averaged over independent runs (ANEES) at
 which should hold 1. Landmarks: all of a run's at its end, horizontally, with the same kind of interval.
 Those of one run share the vehicle's errors, so that a run counts as one sample.
 
-``--vertical-scale`` lets vertical ways, and with them depth, tell the Doppler log's scale: what that costs.
+``--vertical-scale`` lets vertical ways, and with them depth, tell the Doppler log's scale in iSAM2: what that costs.
 
 ``passed``: at the last instant of the nominal basin the ANEES of position and yaw of the invariant filter and of iSAM2
 lie inside the band, and in the basin of scale errors that of their landmarks between 0.8 and 1.2. Of consistent
@@ -37,7 +37,6 @@ sys.path.append(str(Path(__file__).resolve().parent))
 from common import conclude, in_parallel, make_parser, note, print_table, refuse
 from consistency import SETTLING_S, judge
 
-from baselines import invariant_equations
 from sonar_graph.evaluation import ErrorSeries, RunResult, compare, landmark_errors, normalised_squares, rmse
 from sonar_graph.models import by_biases
 from sonar_graph.simulation import BasinOptions, simulate_basin
@@ -97,7 +96,7 @@ def run_seed(basin: Basin, names: tuple[str, ...], has_vertical_scale: bool, see
     """All estimators on one basin."""
     if has_vertical_scale:
         whole: Any = lambda D, dR, dp, up, _, arm: by_biases(D, dR, dp, up, np.zeros(3), arm)  # noqa: E731
-        invariant_equations.by_biases = keyframes.by_biases = whole
+        keyframes.by_biases = whole
     scale_error = basin.scale_sigma * float(np.random.default_rng((seed, 1)).standard_normal())
     sequence = simulate_basin(BasinOptions(seed=seed, dvl_scale_error=scale_error, **basin.options))
     dvl = sequence.calibration.dvl.model_copy(update={"scale_sigma": basin.stated_sigma})
@@ -185,7 +184,7 @@ def main() -> None:
     parser.add_argument("--first-seed", type=int, default=0, help="runs use this seed and those after it")
     parser.add_argument("--basins", default=",".join(BASINS), help=f"some of {','.join(BASINS)}")
     parser.add_argument("--estimators", default=",".join(ESTIMATORS), help=f"some of {','.join(ESTIMATORS)}")
-    parser.add_argument("--vertical-scale", action="store_true", help="let vertical ways tell the scale")
+    parser.add_argument("--vertical-scale", action="store_true", help="let vertical ways tell iSAM2 the scale")
     arguments = parser.parse_args()
     count = arguments.seeds or (4 if arguments.quick else 100)
     basins, names = arguments.basins.split(","), tuple(arguments.estimators.split(","))

@@ -222,14 +222,16 @@ def test_a_correction_keeps_roll_and_yaw_within_half_a_turn():
 
 
 def test_roll_has_the_variance_of_the_tilt_over_the_squared_cosine_of_the_pitch():
-    roll, pitch, sigma, prior = 0.1, -0.9, 0.03, np.array([1e-2, 2e-2, 3e-2, 1e-3, 2e-3, 3e-3])
+    roll, pitch, sigma, prior = 0.1, -0.9, 0.03, np.array([1e-2, 2e-2, 3e-2, 1e-3, 2e-3, 3e-3, 1.0])
     up = np.array([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)])
-    x, P = np.array([1.0, 2.0, 0.7, 0.05, -0.88, 0.3]), np.diag(prior)
-    before, R = x.copy(), np.array([(sigma / np.cos(pitch)) ** 2, sigma**2])
-    ekf_slam.update_up(x, P, up, sigma)
+    slam = begun(Ekf, world_at([0.05, -0.88, 0.3], []), np.diag(prior))
+    _, before, _ = slam.state()
+    slam.update_up(up, sigma, np.eye(3))
+    _, x, P = slam.state()
+    R = np.array([(sigma / np.cos(pitch)) ** 2, sigma**2])
     gain = prior[3:5] / (prior[3:5] + R)
     assert_allclose(x[3:5], before[3:5] + gain * ([roll, pitch] - before[3:5]), atol=1e-12)
-    assert_allclose(np.diag(P), [*prior[:3], *((1 - gain) * prior[3:5]), prior[5]], atol=1e-15)
+    assert_allclose(np.diag(P), [*prior[:3], *((1 - gain) * prior[3:5]), *prior[5:]], atol=1e-15)
 
 
 # ---------------------------------------------------------------------------------------------- invariant filter

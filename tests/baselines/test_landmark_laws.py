@@ -27,6 +27,7 @@ from .filters import (
     NOISE,
     STILL,
     TWIST,
+    Ekf,
     World,
     begun,
     both,
@@ -254,15 +255,17 @@ def test_the_noise_of_a_view_holds_that_of_many_beams_and_without_aperture_is_th
 
 
 def test_gate_and_kernel_judge_a_far_view_by_its_shift_along_the_beam_and_across_it():
-    G_z, noise, missed = TURNED @ np.diag([1.0, 10.0, 10.0]), np.diag([0.04, 0.0009]), np.array([9.0, 7.0, 0.0])
-    S = TURNED @ np.diag([1.0, 9.0, 1.0]) @ TURNED.T
-    outcome, e, S_z, widened = judged_far(TURNED @ missed, S, G_z, noise, math.inf, 1.5)
-    assert_allclose(e, [9.0, 0.7], atol=1e-12)
-    assert_allclose(S_z, np.diag([1.0, 0.09]), atol=1e-12)
-    expected = judged(e, S_z, noise, math.inf, 1.5)
-    assert outcome == expected[0] == USED
-    assert_allclose(widened, G_z[:, :2] @ expected[1] @ G_z[:, :2].T, atol=1e-12)
-    assert judged_far(TURNED @ missed, S, G_z, noise, 3.7, 1.5)[0] == GATED
+    G_z, R_z, z = TURNED @ np.diag([1.0, 10.0, 10.0]), np.diag([0.04, 0.0009]), np.array([10.0, 0.3])
+    e, cov, nothing = TURNED @ [9.0, 7.0, 0.0], TURNED @ np.diag([1.0, 9.0, 1.0]) @ TURNED.T, np.zeros((3, 3))
+    sonar = begun(Ekf, world_at(LEVEL), kernel_width=1.5, gate=1.0).sonar._replace(aperture_rad=0.0)
+    told, noise = judged_far(e, cov, nothing, G_z, sonar, z, R_z)
+    assert told.outcome == USED
+    assert_allclose(told.e, [9.0, 0.7], atol=1e-12)
+    assert_allclose(told.S, np.diag([1.04, 0.0909]), atol=1e-12)
+    widened = judged(told.e, told.S, R_z, math.inf, 1.5)[1]
+    assert_allclose(noise, G_z[:, :2] @ (R_z + widened) @ G_z[:, :2].T, atol=1e-12)
+    assert judged_far(e, cov, nothing, G_z, sonar._replace(gate=3.7), z, R_z)[0].outcome == GATED
+    assert judged_far(e, 1e-6 * cov, nothing, G_z, sonar, z, R_z)[0] is None
 
 
 def test_linear_is_what_errs_by_less_than_the_noise():
