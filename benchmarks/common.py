@@ -4,6 +4,8 @@ import argparse
 import json
 import multiprocessing
 import os
+import platform
+import subprocess
 import sys
 import tarfile
 import tempfile
@@ -112,6 +114,27 @@ def print_table(headers: Sequence[str], rows: Iterable[Sequence[object]]) -> Non
 
 def _cell(value: object) -> str:
     return f"{value:.3f}" if isinstance(value, float) else str(value)
+
+
+def write_results(name: str, title: str, headers: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """Write a table to ``benchmarks/results``, with the commit, the machine and the command that measured it."""
+    root = Path(__file__).resolve().parent
+    described = subprocess.run(["git", "describe", "--always", "--dirty"], cwd=root, capture_output=True, text=True)
+    command = " ".join(["python", Path(sys.argv[0]).resolve().relative_to(root.parent).as_posix(), *sys.argv[1:]])
+    lines = [
+        f"# {title}",
+        "",
+        f"Measured by `{command}` at {described.stdout.strip() or 'an unknown commit'} on {os.cpu_count()} cores,"
+        f" {platform.machine()}, Python {platform.python_version()}.",
+        "",
+        "| " + " | ".join(headers) + " |",
+        "|---" * len(headers) + "|",
+        *("| " + " | ".join(map(_cell, row)) + " |" for row in rows),
+    ]
+    path = root / "results" / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    note(f"wrote {path}")
 
 
 def print_figures(figures: dict[str, Any]) -> None:

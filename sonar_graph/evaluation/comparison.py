@@ -138,7 +138,7 @@ def expense(sequence: Sequence) -> str:
 
     Each estimator needs some `IMU_ROW_S` for a row. One that keeps the joint covariance of n landmarks has d² numbers,
     ``d = 3 n + 15``, and goes over them twice for each detection. One that keeps all detections solves for them at each
-    map, some `SOLVED_DETECTION_S` for each; many detections in one submap take more.
+    map, some `SOLVED_DETECTION_S` for each.
     """
     rows, detections = len(sequence.imu), sequence.detections
     said = [f"{rows} IMU rows, about {rows * IMU_ROW_S / 60:.0f} min"] if rows * IMU_ROW_S > LONG_S else []

@@ -140,7 +140,7 @@ def with_ranges(gone: list[tuple[int, int]], *new: tuple[int, int, float]) -> Ra
     ("lag_s", "oldest"), [(FOREVER_S, 7), (2.6, 17), (2.6, 7)], ids=["all", "recent", "marginalised"]
 )
 def test_what_is_taken_out_was_never_there(monkeypatch, lag_s, oldest):
-    """Least squares without those ranges, also of keyframes in submaps; the history is not solved for it."""
+    """Least squares without those ranges; the history is not solved for it."""
     fed = on_the_rail(NODES, lag_s)
     fed.smoother.solve_history()
     gone = [(k, i) for k in range(oldest, NODES) for i in (4, 7)]

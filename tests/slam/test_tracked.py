@@ -302,7 +302,7 @@ def test_a_landmark_may_begin_late_while_what_waits_makes_the_window_restart(mon
 
 
 def test_late_factors_cost_no_solution_of_the_history(monkeypatch):
-    """Neither those of a track that waited nor of one that was of no landmark, whose keyframes are in submaps."""
+    """Neither those of a track that waited nor of one that was of no landmark."""
     solves = counted(monkeypatch, smoother_module, "solve_in_sight")
     for beliefs in ([FLAT] * 9, [FLAT] * 2 + [[0.0] * 4] * 7):
         dive = Dive(lag_s=0.5)

@@ -159,7 +159,7 @@ class Blame:
     def culprits(self, window: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> list[Withheld]:
         """New factors because of which a window cannot be solved; none where it can, if with better arithmetic.
 
-        Those on keyframes in submaps have a part in its marginals. An `EstimatorError` where a keyframe, or what was in
+        An `EstimatorError` where a keyframe, or what was in
         the window before, is left open.
         """
         graph, inside = gtsam.NonlinearFactorGraph(window), {*window.keyVector(), *self._new_keys}
