@@ -9,8 +9,8 @@ from pydantic import Field
 
 from sonar_graph.calibration import Calibration, Section, require_params
 from sonar_graph.measurements import Floats, Measurements, require_measurements
+from sonar_graph.models import gravity_direction
 from sonar_graph.motion import MotionSource, PreintegratedMotion, require_source
-from sonar_graph.navigation.alignment import gravity_direction
 from sonar_graph.states import (
     CausalEstimates,
     DetectionJournal,

@@ -51,9 +51,11 @@ from sonar_graph.models import (
     Contradictions,
     Mount,
     identify,
+    tilt_sigma,
+    up_direction,
 )
 from sonar_graph.motion import MotionSource, PreintegratedMotion, require_source
-from sonar_graph.navigation.alignment import earth_rate_in_world, tilt_sigma, up_direction
+from sonar_graph.navigation.alignment import earth_rate_in_world
 from sonar_graph.states import (
     OUTCOME_NUMBERS,
     CausalEstimates,

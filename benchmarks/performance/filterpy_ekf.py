@@ -22,13 +22,13 @@ from sonar_graph.models import (
     FLOOR_GATE,
     MINIMUM_PROBABILITY,
     elevation_on_floor,
+    gravity_direction,
     identify,
     locate_jacobians,
     range_azimuth_jacobians,
 )
 from sonar_graph.motion import PreintegratedMotion
 from sonar_graph.navigation import Odometry
-from sonar_graph.navigation.alignment import gravity_direction
 from sonar_graph.sequence import Sequence
 
 GRAVITY_INTERVAL_NS = NS_PER_S

@@ -1,14 +1,17 @@
 """Measurement models, below every estimator: what a sensor measures at a state, its derivatives and its noise.
 
 sonar.py       range and azimuth of a landmark, and the inverse
-aiding.py      headings and position fixes, with Huber's kernel
+aiding.py      gravity, headings and position fixes
 biases.py      biases that last through a run, and what they do to a motion
 kernels.py     robust kernels of range and azimuth
 identity.py    acceptance of a recogniser's identities
 """
 
 # fmt: off
-from sonar_graph.models.aiding import HUBER_WIDTHS, Contradictions, huber_scale, up_and_derivative, yaw_and_derivative
+from sonar_graph.models.aiding import (
+    HUBER_WIDTHS, Contradictions, gravity_direction, huber_scale, tilt_sigma, up_and_derivative, up_direction,
+    yaw_and_derivative,
+)
 from sonar_graph.models.biases import (
     ACCEL, BIASES, COMPASS, HEADING, SCALE, TILT, bias_jacobian, bias_sigmas, by_biases, gyro_bias_of,
 )
@@ -22,6 +25,7 @@ from sonar_graph.models.sonar import (
 from sonar_graph.numerics import gate_threshold
 
 __all__ = [
+    "gravity_direction", "tilt_sigma", "up_direction",
     "ACCEL", "ACCEPTED", "BIASES", "COMPASS", "Contradictions", "FLOOR_GATE", "GaussianKernel", "HEADING",
     "HUBER_WIDTHS", "Kernel", "KernelParams", "MINIMUM_PROBABILITY", "Mount", "Robust", "RobustKernel", "SCALE",
     "TILT", "bias_jacobian", "bias_sigmas", "body_point_jacobian", "by_biases", "elevation_on_floor", "floor_elevation",

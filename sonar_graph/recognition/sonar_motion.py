@@ -7,8 +7,8 @@ depth and the calibration's floor. Nothing stamped after a frame is used for it.
 import numpy as np
 
 from sonar_graph.measurements import NS_PER_S, Depth, Dvl, Floats, Imu
+from sonar_graph.models import gravity_direction
 from sonar_graph.navigation import MotionSource, Odometry, PreintegratedMotion
-from sonar_graph.navigation.alignment import gravity_direction
 from sonar_graph.sequence import Sequence
 from sonar_graph.sonar import FloorView, SonarStep
 

@@ -30,11 +30,11 @@ from sonar_graph.models import (
     Contradictions,
     bias_sigmas,
     by_biases,
+    gravity_direction,
     gyro_bias_of,
     wrap_angle,
 )
 from sonar_graph.motion import MotionSource, PreintegratedMotion
-from sonar_graph.navigation.alignment import gravity_direction
 from sonar_graph.numerics import cross_matrix
 from sonar_graph.slam import factors
 from sonar_graph.slam.odometry_factor import OdometryWithBias

@@ -49,8 +49,7 @@ from sonar_graph.numerics import (
     skew,
     vec,
 )
-from sonar_graph.slam.factors import ORIGIN, gaussian
-from sonar_graph.slam.sighting_factor import poses_of
+from sonar_graph.slam.factors import ORIGIN, gaussian, poses_of
 
 UNIT = gtsam.noiseModel.Unit.Create(6)
 

@@ -13,6 +13,7 @@ from baselines.invariant_ekf import InvariantEkf
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting, Start
 from sonar_graph.errors import AlignmentError
 from sonar_graph.measurements import Dvl, Floats, Imu, Measurements
+from sonar_graph.models.aiding import gravity_direction
 from sonar_graph.motion import earth_rate_in_world
 from sonar_graph.navigation import Odometry, PreintegratedMotion
 from sonar_graph.navigation.alignment.allan import allan_deviation, degrees_of_freedom, density, noise_densities
@@ -25,7 +26,6 @@ from sonar_graph.navigation.alignment.at_rest import (
     in_body_axes,
     roll_and_pitch,
 )
-from sonar_graph.navigation.alignment.gravity import gravity_direction
 from sonar_graph.testing import check_consistent
 
 from . import ways

@@ -11,11 +11,11 @@ from scipy.stats import chi2, multivariate_normal
 
 from sonar_graph.measurements import NO_TRACK, Floats, LandmarkDetections
 from sonar_graph.models import ACCEPTED, identify
-from sonar_graph.slam.landmarks.joint_compatibility import UNPAIRED, Innovations, Pairing, drop_unlikely, pair_jointly
 from sonar_graph.slam.landmarks.landmark_graph import AmendableJournal, Assignment
 from sonar_graph.slam.landmarks.mixture import LEAST_LANDMARKS, IdentityPosterior, RecogniserErrors
 from sonar_graph.slam.landmarks.sighting import Sighting
 from sonar_graph.slam.landmarks.tracked import NO_LANDMARK, UNDECIDED, decide, second_rows_of_tracks
+from sonar_graph.slam.landmarks.unknown import UNPAIRED, Innovations, Pairing, drop_unlikely, pair_jointly
 from sonar_graph.slam.smoother import Sightline
 from sonar_graph.states import OUTCOME_NUMBERS, Outcome
 

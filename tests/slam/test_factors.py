@@ -16,8 +16,8 @@ from scipy.stats import chi
 from sonar_graph.calibration import Calibration, PlanarMotion, Start
 from sonar_graph.models import HUBER_WIDTHS, RobustKernel, range_azimuth
 from sonar_graph.slam import factors
+from sonar_graph.slam.factors import SightingStack
 from sonar_graph.slam.odometry_factor import OdometryStack, OdometryWithBias
-from sonar_graph.slam.sighting_factor import SightingStack
 from sonar_graph.testing import check_consistent, check_jacobians
 
 from .graphs import information

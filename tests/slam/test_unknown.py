@@ -15,14 +15,17 @@ from sonar_graph.calibration import SonarCalibration
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 from sonar_graph.slam.landmarks import unknown as module
-from sonar_graph.slam.landmarks.joint_compatibility import UNPAIRED, Innovations, Pairing, pair_jointly
 from sonar_graph.slam.landmarks.landmark_graph import AmendableJournal, Assignment, LandmarkGraph
 from sonar_graph.slam.landmarks.sighting import Sighting, SightingFactors, late_view
 from sonar_graph.slam.landmarks.unknown import (
     ODDS,
+    UNPAIRED,
     AssociatedUnknown,
+    Innovations,
     NamelessLandmarks,
+    Pairing,
     nearest_duplicates,
+    pair_jointly,
 )
 from sonar_graph.slam.smoother import JointCovariance, Sightline, Smoother
 from sonar_graph.states import FIRST_ANONYMOUS_ID, Outcome

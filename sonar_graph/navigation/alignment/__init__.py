@@ -5,13 +5,12 @@ from sonar_graph.motion import earth_rate_in_world
 from sonar_graph.navigation.alignment.allan import longest_rest, noise_densities
 from sonar_graph.navigation.alignment.at_rest import InitialTilt, align_at_rest
 from sonar_graph.navigation.alignment.dvl_imu import DvlMatch, Estimates3D, match_dvl_to_imu
-from sonar_graph.navigation.alignment.gravity import gravity_direction, tilt_sigma, up_direction
 from sonar_graph.navigation.alignment.in_motion import LONGEST_S, align_in_motion, until_hole
 from sonar_graph.navigation.alignment.reference_offset import match_reference_to_imu
 from sonar_graph.navigation.alignment.time_offset import Estimate1D
 
 __all__ = [
     "DvlMatch", "Estimate1D", "Estimates3D", "InitialTilt", "LONGEST_S", "align_at_rest", "align_in_motion",
-    "earth_rate_in_world", "gravity_direction", "longest_rest", "match_dvl_to_imu", "match_reference_to_imu",
-    "noise_densities", "tilt_sigma", "until_hole", "up_direction",
+    "earth_rate_in_world", "longest_rest", "match_dvl_to_imu", "match_reference_to_imu",
+    "noise_densities", "until_hole",
 ]

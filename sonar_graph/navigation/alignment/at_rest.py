@@ -35,7 +35,7 @@ class InitialTilt:
     Examples
     --------
     >>> import numpy as np
-    >>> from sonar_graph.navigation.alignment import align_at_rest
+    >>> from sonar_graph.navigation.alignment import (align_at_rest)
     >>> from sonar_graph.testing import still_world
     >>> world = still_world()
     >>> tilt = align_at_rest(world.imu, world.calibration)
@@ -136,7 +136,7 @@ def align_at_rest(imu: Imu, calibration: Calibration, dvl: Dvl | None = None) ->
     >>> import numpy as np
     >>> from sonar_graph.calibration import Calibration
     >>> from sonar_graph.measurements import Imu
-    >>> from sonar_graph.navigation.alignment import align_at_rest
+    >>> from sonar_graph.navigation.alignment import (align_at_rest)
     >>> force = np.tile([0.0, 9.80665 * np.sin(0.1), 9.80665 * np.cos(0.1)], (500, 1))
     >>> tilt = align_at_rest(Imu(np.arange(500) * 10_000_000, np.zeros((500, 3)), force), Calibration())
     >>> round(tilt.roll_rad, 6)

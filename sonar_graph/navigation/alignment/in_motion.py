@@ -129,7 +129,7 @@ def align_in_motion(imu: Imu, dvl: Dvl, calibration: Calibration) -> InitialTilt
     >>> import numpy as np
     >>> from sonar_graph.calibration import Calibration
     >>> from sonar_graph.measurements import Dvl, Imu
-    >>> from sonar_graph.navigation.alignment import align_in_motion
+    >>> from sonar_graph.navigation.alignment import (align_in_motion)
     >>> force = np.tile([0.0, 9.80665 * np.sin(0.1), 9.80665 * np.cos(0.1)], (500, 1))
     >>> imu = Imu(np.arange(500) * 10_000_000, np.zeros((500, 3)), force)
     >>> dvl = Dvl(np.arange(25) * 200_000_000, np.tile([1.0, 0.0, 0.0], (25, 1)), np.full((25, 3, 3), np.nan))

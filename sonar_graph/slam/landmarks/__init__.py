@@ -3,7 +3,7 @@
 sighting.py             detections of a frame, sightings tied to a keyframe, and their factors
 landmark_graph.py       states of a detection; decisions of a policy, and the one place that applies them
 tracked.py              policies "robust" (default) and "gate": a wrong identity is retracted when its track is renamed
-unknown.py              detections that name no landmark, paired by joint_compatibility.py
+unknown.py              detections that name no landmark, paired jointly
 mixture_policy.py       policy "max-mixture", with the log densities and votes of mixture.py
 """
 

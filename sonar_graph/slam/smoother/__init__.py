@@ -2,21 +2,19 @@
 
 smoother.py        the growing graph: updates, exchanges of factors, restarts
 window.py          GTSAM's iSAM2, and its fixed-lag smoother for a bounded history
-batch_solution.py  Levenberg-Marquardt over the whole graph
-covariance.py      marginal and joint covariances
-factor_store.py    groups of factors by handle
+batch_solution.py  Levenberg-Marquardt over the whole graph, marginal and joint covariances
+factor_store.py    variables, and groups of factors by handle
 observability.py   factors that leave directions open, and messages about them
-variables.py       kinds, dimensions and names of variables
 """
 
 # fmt: off
-from sonar_graph.slam.smoother.batch_solution import Sightline, solve, solve_in_sight
-from sonar_graph.slam.smoother.covariance import JointCovariance, Marginals
-from sonar_graph.slam.smoother.factor_store import FactorGroup, Factors
+from sonar_graph.slam.smoother.batch_solution import solve, solve_in_sight
+from sonar_graph.slam.smoother.batch_solution import JointCovariance, Marginals
+from sonar_graph.slam.smoother.factor_store import FactorGroup, Factors, Sightline
 from sonar_graph.slam.smoother.smoother import (
     BoundedHistory, Changed, Estimates, HistoryParams, Smoother, SmootherParams, WholeHistory,
 )
-from sonar_graph.slam.smoother.variables import Known
+from sonar_graph.slam.smoother.factor_store import Known
 
 __all__ = [
     "BoundedHistory", "Changed", "Estimates", "FactorGroup", "Factors", "HistoryParams", "JointCovariance", "Known",

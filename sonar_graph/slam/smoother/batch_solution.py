@@ -1,18 +1,18 @@
-"""Levenberg-Marquardt solution of a whole graph, and joint covariances.
+"""Levenberg-Marquardt solution of a whole graph, and marginal and joint covariances.
 
 GTSAM's optimisers hand each Python factor a copy of all values, at a cost quadratic in the length of a run; linearising
 from Python does not. So the loop is here, and the linear algebra is GTSAM's.
 
 The azimuth factor holds in the half space ahead of the sonar. For a landmark behind, GTSAM's camera has a constant
 error and no gradient. A large correction, such as a loop closed after much drift, may put a landmark there; then its
-sightings say where to start it instead (docs/theory/isam2.md).
+sightings start it again (docs/theory/isam2.md).
 """
 
 from __future__ import annotations
 
-import math
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -20,8 +20,7 @@ import gtsam
 import numpy as np
 
 from sonar_graph.measurements import Floats
-from sonar_graph.models import project, wrap_angle
-from sonar_graph.slam.smoother.variables import Known, picked, tangent_size
+from sonar_graph.slam.smoother.factor_store import Sightlines, picked, tangent_size
 
 MAX_STEPS = 50
 """Steps that a descent may try, whether or not they lower the error: each costs a factorisation of the graph."""
@@ -190,41 +189,6 @@ def qr_tree(linear: gtsam.GaussianFactorGraph, values: gtsam.Values) -> gtsam.IS
     return tree
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Sightline:
-    """One sighting of a landmark."""
-
-    pose_key: int
-    body_T_sonar: gtsam.Pose3
-    """The sonar in the body frame of that keyframe."""
-    z: Floats
-    """Range (m) and azimuth (rad), shape (2,)."""
-
-    def point(self, values: Known) -> Floats:
-        """Point of the world where the landmark was measured, at elevation 0, shape (3,), m."""
-        on_beam = self.z[0] * np.array([np.cos(self.z[1]), np.sin(self.z[1]), 0.0])
-        return self._world_T_sonar(values).transformFrom(on_beam)
-
-    def is_behind(self, values: Known, landmark: Floats) -> bool:
-        """True when a point of the world is a right angle or more off the measured azimuth."""
-        x, y, _ = self._world_T_sonar(values).transformTo(landmark)
-        return bool(x * np.cos(self.z[1]) + y * np.sin(self.z[1]) <= 0)
-
-    def miss_m(self, values: Known, landmark: Floats) -> float:
-        """Distance by which range and azimuth miss a point of the world."""
-        x, y, z = self._world_T_sonar(values).transformTo(landmark)
-        expected, _ = project(np.array([x, y, z]))
-        turn_rad = wrap_angle(expected[1] - self.z[1])
-        return math.hypot(expected[0] - self.z[0], self.z[0] * turn_rad)
-
-    def _world_T_sonar(self, values: Known) -> gtsam.Pose3:
-        return values.atPose3(self.pose_key).compose(self.body_T_sonar)
-
-
-Sightlines = Mapping[int, Sequence[Sightline]]
-"""Sightings that have become factors, by landmark's key."""
-
-
 OUTVOTED, LEAST_SCATTER_M = 5.0, 0.01
 """A landmark lies where only a few sightings say if the median one misses it by so many times their scatter about the
 median of all, which is at least so much."""
@@ -276,3 +240,86 @@ def solve_in_sight(graph: gtsam.NonlinearFactorGraph, initial: gtsam.Values, sig
             break
         best = retried
     return best.values
+
+
+@dataclass(frozen=True, eq=False)
+class JointCovariance:
+    """Joint covariance of some variables of a graph, in the tangent space of each.
+
+    One matrix, so that compiled code can pick what it needs; GTSAM's `JointMarginal` hands out one block a call.
+    """
+
+    matrix: Floats
+    """Shape (n, n), in the order in which the variables were asked for."""
+    rows: dict[int, int]
+    """The first row of each variable, by key."""
+
+    @classmethod
+    def of(cls, marginals: Marginals | gtsam.ISAM2, keys: list[int]) -> JointCovariance:
+        """Ask for poses (6 rows each), biases (11) and points (3)."""
+        rows, n = {}, 0
+        for key in keys:
+            rows[key] = n
+            n += tangent_size(key)
+        return cls(marginals.jointMarginalCovariance(keys).fullMatrix(), rows)
+
+    def at(self, a: int, b: int) -> Floats:
+        """The block of two variables."""
+        i, j = self.rows[a], self.rows[b]
+        return self.matrix[i : i + tangent_size(a), j : j + tangent_size(b)]
+
+
+class KeptCovariance:
+    """One joint covariance for all questions between two updates.
+
+    A question costs an elimination of most of the map, whatever it asks for. So the first question after an update also
+    asks for the landmarks that the next frame is likely to show.
+    """
+
+    def __init__(self) -> None:
+        self._joint: JointCovariance | None = None
+        self._asked: set[int] = set()
+
+    def of(
+        self, marginals: Marginals | gtsam.ISAM2, keys: list[int], likely: Callable[[], list[int]]
+    ) -> JointCovariance:
+        """Joint covariance of these variables, and possibly of more; ``likely`` names those asked for next."""
+        self._asked.update(keys)
+        if self._joint is None or not self._joint.rows.keys() >= self._asked:
+            self._joint = JointCovariance.of(marginals, sorted(self._asked.union(likely())))
+        return self._joint
+
+    def renew(self) -> None:
+        """The graph has changed."""
+        self._joint = None
+        self._asked = set()
+
+
+class Marginals:
+    """Marginal covariances of a graph, linearised at the values; by QR where Cholesky refuses.
+
+    GTSAM eliminates anew for each question, so that Cholesky may refuse one variable and not another. Each question
+    decides for itself: no answer depends on what was asked before.
+    """
+
+    def __init__(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
+        self._linear, self._values = StackedGraph(graph).linearize(values), values
+        self._by_cholesky: gtsam.Marginals | None = None
+        with suppress(RuntimeError):
+            self._by_cholesky = gtsam.Marginals(self._linear, values)
+        self._by_qr: gtsam.ISAM2 | None = None
+
+    def marginalCovariance(self, key: int) -> Floats:
+        """Covariance of one variable; the name is GTSAM's."""
+        return np.asarray(self._ask(lambda marginals: marginals.marginalCovariance(key)))
+
+    def jointMarginalCovariance(self, keys: list[int]) -> gtsam.JointMarginal:
+        """Joint covariance of some; the name is GTSAM's."""
+        return self._ask(lambda marginals: marginals.jointMarginalCovariance(keys))
+
+    def _ask(self, question: Callable[[gtsam.Marginals | gtsam.ISAM2], Any]) -> Any:
+        if self._by_cholesky is not None:
+            with suppress(RuntimeError):
+                return question(self._by_cholesky)
+        self._by_qr = self._by_qr or qr_tree(self._linear, self._values)
+        return question(self._by_qr)

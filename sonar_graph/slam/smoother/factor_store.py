@@ -1,20 +1,120 @@
-"""Factors of the graph by handle, in groups that are used together or not at all, each factor with its label.
+"""Variables and factors of the graph: kinds of keys, and groups of factors by handle.
 
-One store serves window and history: groups are new until the window has taken them up. Of a bounded window a group
-leaves with the oldest pose of its factors, or bias where they have none: what it says is in marginals then.
+A group of factors is used together or not at all, and each factor has a label for messages. One store serves window and
+history: groups are new until the window has taken them up. A group leaves a bounded window with the oldest pose of its
+factors, or bias where they have none; marginals contain its information then.
 """
 
+import math
 from collections import defaultdict
-from collections.abc import Container, Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import gtsam
+import numpy as np
 
-from sonar_graph.slam.smoother.batch_solution import Sightline, Sightlines
-from sonar_graph.slam.smoother.variables import is_landmark, is_pose
+from sonar_graph.measurements import Floats
+from sonar_graph.models import BIASES, project, wrap_angle
+
+POSE = ord("x")
+LANDMARK = ord("l")
+BIAS = ord("b")
+TANGENT_SIZES = {POSE: 6, LANDMARK: 3, BIAS: BIASES}
+NAMES = {POSE: "keyframe", LANDMARK: "landmark", BIAS: "gyro bias"}
+
+
+class Known(Protocol):
+    """Values by key, as `gtsam.Values` has them."""
+
+    def exists(self, key: int, /) -> bool:
+        """True for a variable that is known."""
+        ...
+
+    def atPose3(self, key: int, /) -> gtsam.Pose3:
+        """Pose of a keyframe."""
+        ...
+
+    def atPoint3(self, key: int, /) -> Floats:
+        """Position of a landmark."""
+        ...
+
+    def atVector(self, key: int, /) -> Floats:
+        """Biases."""
+        ...
+
+
+def kind(key: int) -> int:
+    """Character of a variable's symbol, which GTSAM keeps in the highest byte of its key."""
+    return key >> 56
+
+
+def tangent_size(key: int) -> int:
+    """Dimension of a variable: 6 for a pose, 11 for the biases, 3 for a point."""
+    return TANGENT_SIZES[kind(key)]
+
+
+def is_pose(key: int) -> bool:
+    """True for a keyframe."""
+    return kind(key) == POSE
+
+
+def is_landmark(key: int) -> bool:
+    """True for a landmark."""
+    return kind(key) == LANDMARK
+
+
+def variable_name(key: int) -> str:
+    """Kind and number of a variable, in words."""
+    return f"{NAMES.get(kind(key), 'variable')} {gtsam.Symbol(key).index()}"
+
+
+def picked(values: Known, keys: Iterable[int]) -> gtsam.Values:
+    """Values of some variables: poses and vectors."""
+    some = gtsam.Values()
+    for key in keys:
+        value = values.atPose3(key) if is_pose(key) else values.atVector(key)
+        some.insert(key, value)
+    return some
+
 
 Factors = dict[str, gtsam.NonlinearFactor]
 """Factors by their labels in messages, such as "range"."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Sightline:
+    """One sighting of a landmark."""
+
+    pose_key: int
+    body_T_sonar: gtsam.Pose3
+    """The sonar in the body frame of that keyframe."""
+    z: Floats
+    """Range (m) and azimuth (rad), shape (2,)."""
+
+    def point(self, values: Known) -> Floats:
+        """Point of the world where the landmark was measured, at elevation 0, shape (3,), m."""
+        on_beam = self.z[0] * np.array([np.cos(self.z[1]), np.sin(self.z[1]), 0.0])
+        return self._world_T_sonar(values).transformFrom(on_beam)
+
+    def is_behind(self, values: Known, landmark: Floats) -> bool:
+        """True when a point of the world is a right angle or more off the measured azimuth."""
+        x, y, _ = self._world_T_sonar(values).transformTo(landmark)
+        return bool(x * np.cos(self.z[1]) + y * np.sin(self.z[1]) <= 0)
+
+    def miss_m(self, values: Known, landmark: Floats) -> float:
+        """Distance by which range and azimuth miss a point of the world."""
+        x, y, z = self._world_T_sonar(values).transformTo(landmark)
+        expected, _ = project(np.array([x, y, z]))
+        turn_rad = wrap_angle(expected[1] - self.z[1])
+        return math.hypot(expected[0] - self.z[0], self.z[0] * turn_rad)
+
+    def _world_T_sonar(self, values: Known) -> gtsam.Pose3:
+        return values.atPose3(self.pose_key).compose(self.body_T_sonar)
+
+
+Sightlines = Mapping[int, Sequence[Sightline]]
+"""Sightings that have become factors, by landmark's key."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -17,8 +17,7 @@ import numpy as np
 
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats
-from sonar_graph.slam.smoother.factor_store import FactorStore
-from sonar_graph.slam.smoother.variables import tangent_size, variable_name
+from sonar_graph.slam.smoother.factor_store import FactorStore, tangent_size, variable_name
 
 Labelled = tuple[str, gtsam.NonlinearFactor]
 MARGINAL = "marginal of what left the window"

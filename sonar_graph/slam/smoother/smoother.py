@@ -20,11 +20,22 @@ from pydantic import Field
 from sonar_graph.calibration import Section
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats
-from sonar_graph.slam.smoother.batch_solution import Sightline, solve_in_sight
-from sonar_graph.slam.smoother.covariance import JointCovariance, KeptCovariance, Marginals
-from sonar_graph.slam.smoother.factor_store import FactorGroup, Factors, FactorStore
+from sonar_graph.slam.smoother.batch_solution import (
+    JointCovariance,
+    KeptCovariance,
+    Marginals,
+    solve_in_sight,
+)
+from sonar_graph.slam.smoother.factor_store import (
+    FactorGroup,
+    Factors,
+    FactorStore,
+    Sightline,
+    is_pose,
+    picked,
+    variable_name,
+)
 from sonar_graph.slam.smoother.observability import Blame, Withheld
-from sonar_graph.slam.smoother.variables import is_pose, picked, variable_name
 from sonar_graph.slam.smoother.window import FixedLagWindow, Thresholds, WholeWindow
 from sonar_graph.tagged_sections import tagged
 

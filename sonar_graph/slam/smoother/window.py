@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 import gtsam
 import numpy as np
 
-from sonar_graph.slam.smoother.factor_store import FactorGroup, graph_of
-from sonar_graph.slam.smoother.variables import BIAS, LANDMARK, TANGENT_SIZES, picked
+from sonar_graph.slam.smoother.factor_store import BIAS, LANDMARK, TANGENT_SIZES, FactorGroup, graph_of, picked
 
 NEVER = 1_000_000_000
 """Updates between two relinearisations that iSAM2 would begin by itself."""
