@@ -1,11 +1,4 @@
-"""Measurement models, below every estimator: what a sensor measures at a state, its derivatives and its noise.
-
-sonar.py       range and azimuth of a landmark, and the inverse
-aiding.py      gravity, headings and position fixes
-biases.py      biases that last through a run, and what they do to a motion
-kernels.py     robust kernels of range and azimuth
-identity.py    acceptance of a recogniser's identities
-"""
+"""Measurement models, below every estimator: predicted measurements, their derivatives, noise and kernels."""
 
 # fmt: off
 from sonar_graph.models.aiding import (
@@ -25,12 +18,11 @@ from sonar_graph.models.sonar import (
 from sonar_graph.numerics import gate_threshold
 
 __all__ = [
-    "gravity_direction", "tilt_sigma", "up_direction",
-    "ACCEL", "ACCEPTED", "BIASES", "COMPASS", "Contradictions", "FLOOR_GATE", "GaussianKernel", "HEADING",
-    "HUBER_WIDTHS", "Kernel", "KernelParams", "MINIMUM_PROBABILITY", "Mount", "Robust", "RobustKernel", "SCALE",
-    "TILT", "bias_jacobian", "bias_sigmas", "body_point_jacobian", "by_biases", "elevation_on_floor", "floor_elevation",
-    "gate_threshold", "gyro_bias_of", "huber_scale", "identify", "locate", "locate_from_body", "locate_jacobians",
-    "project", "project_points", "range_azimuth", "range_azimuth_jacobians", "sonar_point", "sonar_point_jacobian",
-    "up_and_derivative",
-    "view_from_body", "view_points", "wrap_angle", "yaw_and_derivative",
+    "ACCEL", "ACCEPTED", "bias_jacobian", "bias_sigmas", "BIASES", "body_point_jacobian", "by_biases", "COMPASS",
+    "Contradictions", "elevation_on_floor", "floor_elevation", "FLOOR_GATE", "gate_threshold", "GaussianKernel",
+    "gravity_direction", "gyro_bias_of", "HEADING", "huber_scale", "HUBER_WIDTHS", "identify", "Kernel", "KernelParams",
+    "locate", "locate_from_body", "locate_jacobians", "MINIMUM_PROBABILITY", "Mount", "project", "project_points",
+    "range_azimuth", "range_azimuth_jacobians", "Robust", "RobustKernel", "SCALE", "sonar_point",
+    "sonar_point_jacobian", "TILT", "tilt_sigma", "up_and_derivative", "up_direction", "view_from_body", "view_points",
+    "wrap_angle", "yaw_and_derivative",
 ]

@@ -41,7 +41,3 @@ def compiled_late(*arguments: str) -> list[str]:
 @pytest.mark.parametrize("estimator", ["isam2", "ekf-slam"])
 def test_a_run_after_the_warm_up_compiles_nothing(estimator: str):
     assert compiled_late(estimator) == []
-
-
-def test_a_warm_up_without_marginalised_keyframes_leaves_something_to_compile():
-    assert any(name.startswith("level_frame") for name in compiled_late("isam2", "40"))

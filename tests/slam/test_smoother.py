@@ -7,7 +7,7 @@ from gtsam.symbol_shorthand import B, L, X
 
 from sonar_graph.calibration import Calibration, Start
 from sonar_graph.slam import factors
-from sonar_graph.slam.smoother import Smoother, batch_solution
+from sonar_graph.slam.smoother import Sightline, Smoother, batch_solution
 from sonar_graph.slam.smoother.batch_solution import solve
 from sonar_graph.slam.smoother.factor_store import FactorGroup
 from sonar_graph.slam.smoother.window import Thresholds, WholeWindow
@@ -83,25 +83,26 @@ def test_biases_in_a_row_are_least_squares(lag_s):
     assert np.diag(smoother.marginals.marginalCovariance(B(7))) == pytest.approx([cov[7, 7]] * 11, abs=1e-9)
 
 
-def test_covariances_are_computed_once_an_update_for_all_that_was_asked_for_lately(monkeypatch):
-    """Successive frames show mostly the same landmarks: those asked for before an update come with the first question
-    after it, also after settling, but no longer; poses not at all, since they may have left the window."""
+def test_one_covariance_a_step_answers_for_all_landmarks_in_reach(monkeypatch):
+    """A question costs an elimination of most of the map; the first one includes what the next frame may show."""
     fed = in_the_basin(6, FOREVER_S)
     fed.smoother.settle(5.0)
     asked = counted(monkeypatch, gtsam.ISAM2, "jointMarginalCovariance")
-    for news, keys in ((None, [L(3)]), (None, [L(5)]), (fed.smoother.update, []), (None, [L(5)])):
-        if news:
-            news(5.0)
-        found = fed.joint(*keys, X(5))
-    assert [set(keys) for _, keys in asked] == [{X(5), L(3)}, {X(5), L(3), L(5)}, {X(5), L(3), L(5)}]
-    expected = fed.dense(fed.smoother.values, L(5), X(5))
-    assert np.allclose(found, expected, rtol=1e-3, atol=1e-5 * np.abs(expected).max())
-    fed.smoother.settle(5.0)
-    fed.smoother.update(5.0)
-    fed.joint(X(4))
-    fed.smoother.update(5.0)
     fed.joint(X(5))
-    assert [set(keys) for _, keys in asked[3:]] == [{X(4), L(5)}, {X(5)}]
+    fed.joint(X(5), L(3))
+    assert [set(keys) for _, keys in asked] == [{X(5)}, {X(5), L(3)}]  # no range was measured yet
+    z = polar(fed.smoother.values.atPose3(X(5)).compose(SONAR), fed.smoother.values.atPoint3(L(5)))
+    new = factors.landmark_sighting(X(5), L(5), SONAR, z, np.diag([4e-4, 8e-5]), plain)
+    fed.groups[fed.smoother.add(new, (L(5), Sightline(X(5), SONAR, z)))] = new
+    fed.smoother.update(5.0)
+    asked.clear()
+    found = fed.joint(X(5))
+    for landmark in (L(3), L(5)):
+        fed.joint(X(5), landmark)
+    assert len(asked) == 1
+    assert {X(5), L(3), L(5)} <= set(asked[0][1])
+    expected = fed.dense(fed.smoother.values, X(5))
+    assert np.allclose(found, expected, rtol=1e-3, atol=1e-5 * np.abs(expected).max())
 
 
 def test_covariances_are_those_of_where_the_window_has_settled():
