@@ -8,13 +8,12 @@ from gtsam.symbol_shorthand import L, X
 from sonar_graph.slam import factors
 from sonar_graph.slam.smoother import Marginals, Smoother, batch_solution
 from sonar_graph.slam.smoother.batch_solution import (
-    Sightline,
-    Sightlines,
     misplaced,
     placed_again,
     solve,
     solve_in_sight,
 )
+from sonar_graph.slam.smoother.factor_store import Sightline, Sightlines
 
 from .fed import FOREVER_S, SONAR, in_the_basin
 from .graphs import gtsams_solution
