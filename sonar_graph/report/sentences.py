@@ -77,6 +77,7 @@ def finding(comparison: Comparison) -> list[str]:
     if not comparison.sequence.detections:
         sentences.append(no_detections(comparison))
     sentences += lost_runs(comparison)
+    sentences += far_views(comparison)
     metric = headline_metric(comparison)
     if metric is None:
         if len(comparison.failed_runs) == len(runs):
@@ -217,6 +218,18 @@ def lost_runs(comparison: Comparison) -> list[str]:
                 f"(try {without}); its NIS only tells of what the gate let through."
             )
     return said
+
+
+def far_views(comparison: Comparison) -> list[str]:
+    """A sentence on each filter that did more than the paper's observation (6) and (7) in a log with gaps."""
+    if "log.gaps" not in comparison.sequence.notes:
+        return []
+    return [
+        f"{run.estimator} compared landmarks far from where they were predicted with the point seen (far_views), which "
+        "equations (6) and (7) do not."
+        for run in comparison.runs
+        if flattened(run.params).get("far_views")
+    ]
 
 
 def doubt_of_identities(comparison: Comparison) -> list[str]:

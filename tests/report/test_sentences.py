@@ -251,6 +251,17 @@ def test_an_estimator_that_refuses_a_fifth_of_the_detections_is_called_lost(gate
     assert detection_scores(few)["detections.nis"].verdict == ("" if told else "over-cautious")
 
 
+def test_a_filter_with_more_than_the_paper_s_observation_is_named_where_the_log_has_gaps():
+    comparison = basin_comparison(60)
+    run = replace(comparison.runs[1], params={"far_views": True})
+    gaps = replace(comparison.sequence, notes={"log.gaps": "dvl: silent for 60 s"})
+    for sequence, params, count in ((gaps, run.params, 1), (gaps, {}, 0), (comparison.sequence, run.params, 0)):
+        one = with_run(replace(comparison, sequence=sequence), replace(run, params=params))
+        told = [sentence for sentence in sentences.finding(one) if "(far_views)" in sentence]
+        assert told == sentences.far_views(one)
+        assert len(told) == count
+
+
 def with_map(
     ids: np.ndarray, offsets_m: list[float], policy: str = "robust", *, has_truth: bool = True, **changes: object
 ) -> Comparison:
