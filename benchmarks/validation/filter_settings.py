@@ -11,7 +11,7 @@ message of a lock-out.
 Far views: short missions that lose bottom lock for 60 and 120 s, both filters with `far_views` and without; NEES of
 position over 3 and error (m, rms) so many seconds after the gap.
 
-    python benchmarks/validation/filter_settings.py --part kernel --data /work/recordings
+    python benchmarks/validation/filter_settings.py --part kernel --data recordings
     python benchmarks/validation/filter_settings.py --part far
 """
 
