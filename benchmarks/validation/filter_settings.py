@@ -60,7 +60,7 @@ def read(folders: dict[str, Path], world: str, number: int) -> Sequence:
         assert recorded.truth is not None
         dvl_offset = match_dvl_to_imu(recorded.imu, recorded.dvl, recorded.calibration).offset.value
         reference_offset = match_reference_to_imu(recorded.imu, recorded.truth, recorded.calibration).offset.value
-        sequence = add_landmarks(realigned(recorded, dvl_offset, reference_offset), FAR)
+        sequence = add_landmarks(realigned(recorded, dvl_offset, reference_offset), FAR.model_copy(update={"wrong_id_rate": 0.0}))
         dvl = sequence.calibration.dvl.model_copy(update={"velocity_sigma_m_s": SIGMA_AGAINST_REFERENCE_M_S})
         return replace(sequence, calibration=sequence.calibration.model_copy(update={"dvl": dvl}))
     if world == "dlr":
