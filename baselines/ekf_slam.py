@@ -19,7 +19,7 @@ body rates, ``E = W^-1``. Derivation, and the choices that the paper leaves open
 """
 
 import math
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -32,6 +32,7 @@ from baselines.kalman import (
     distance,
     judged,
     judged_far,
+    motion_noise,
     polar_covariance,
     stands_on_floor,
     symmetric,
@@ -42,12 +43,31 @@ from sonar_graph.models import (
     body_point_jacobian,
     huber_scale,
     locate_from_body,
-    view_from_body,
+    sight_of,
     wrap_angle,
     yaw_and_derivative,
 )
 from sonar_graph.motion import MotionSource
-from sonar_graph.numerics import compiled, cross_matrix
+from sonar_graph.numerics import (
+    O3,
+    Mat3,
+    Mat6,
+    Vec3,
+    Vec6,
+    compiled,
+    cross,
+    inlined,
+    mat,
+    mat6,
+    skew,
+    store,
+    store6,
+    store_all,
+    store_row,
+    store_row6,
+    store_vector,
+    vec,
+)
 
 Z, ROLL, PITCH, YAW = 2, 3, 4, 5
 POSE, COMPASS, MAP, LANDMARK = 6, 6, 7, 3
@@ -59,74 +79,115 @@ MOST_PITCH_RAD = 0.5 * math.pi - 1e-3
 # Fossen, "Handbook of Marine Craft Hydrodynamics and Motion Control", 2011, (2.18), (2.28)
 
 
-@compiled
-def rotation_from_euler(angles: Floats) -> Floats:
-    """``world_R_body = Rz(psi) Ry(theta) Rx(phi)``, shape (3, 3)."""
-    sr = math.sin(angles[0])
-    cr = math.cos(angles[0])
-    sp = math.sin(angles[1])
-    cp = math.cos(angles[1])
-    sy = math.sin(angles[2])
-    cy = math.cos(angles[2])
-    return np.array(
-        [
-            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-            [-sp, cp * sr, cp * cr],
-        ]
+@inlined
+def rotation_from_euler(roll: float, pitch: float, yaw: float) -> Mat3:
+    """``world_R_body = Rz(psi) Ry(theta) Rx(phi)``."""
+    sr = math.sin(roll)
+    cr = math.cos(roll)
+    sp = math.sin(pitch)
+    cp = math.cos(pitch)
+    sy = math.sin(yaw)
+    cy = math.cos(yaw)
+    return Mat3(
+        Vec3(cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
+        Vec3(sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
+        Vec3(-sp, cp * sr, cp * cr),
     )
 
 
-@compiled
-def euler_from_rotation(R: Floats) -> Floats:
-    """Angles of a rotation, shape (3,), with the pitch at least 1 mrad from 90 degrees: by 1 mrad another attitude."""
-    pitch = math.atan2(-R[2, 0], math.hypot(R[2, 1], R[2, 2]))
+@inlined
+def euler_from_rotation(R: Mat3) -> Vec3:
+    """Angles of a rotation, with the pitch at least 1 mrad from 90 degrees: by 1 mrad another attitude."""
+    pitch = math.atan2(-R.z.x, math.hypot(R.z.y, R.z.z))
     pitch = max(-MOST_PITCH_RAD, min(pitch, MOST_PITCH_RAD))
-    return np.array([math.atan2(R[2, 1], R[2, 2]), pitch, math.atan2(R[1, 0], R[0, 0])])
+    return Vec3(math.atan2(R.z.y, R.z.z), pitch, math.atan2(R.y.x, R.x.x))
 
 
-@compiled
-def body_rates_from_euler(angles: Floats) -> Floats:
-    """W: body rates are ``w = W (phi', theta', psi')^T``, shape (3, 3)."""
-    sr = math.sin(angles[0])
-    cr = math.cos(angles[0])
-    sp = math.sin(angles[1])
-    cp = math.cos(angles[1])
-    return np.array([[1.0, 0.0, -sp], [0.0, cr, sr * cp], [0.0, -sr, cr * cp]])
+@inlined
+def body_rates_from_euler(roll: float, pitch: float) -> Mat3:
+    """W: body rates are ``w = W (phi', theta', psi')^T``."""
+    sr = math.sin(roll)
+    cr = math.cos(roll)
+    sp = math.sin(pitch)
+    cp = math.cos(pitch)
+    return Mat3(Vec3(1.0, 0.0, -sp), Vec3(0.0, cr, sr * cp), Vec3(0.0, -sr, cr * cp))
+
+
+@inlined
+def euler_rates_from_body(roll: float, pitch: float) -> Mat3:
+    """``E = W^-1``: Euler rates are ``(phi', theta', psi')^T = E w``."""
+    sr = math.sin(roll)
+    cr = math.cos(roll)
+    cp = math.cos(pitch)
+    tp = math.tan(pitch)
+    return Mat3(Vec3(1.0, sr * tp, cr * tp), Vec3(0.0, cr, -sr), Vec3(0.0, sr / cp, cr / cp))
 
 
 # -------------------------------------------------------------------------------- prediction
 
 
+class EulerPoseAfter(NamedTuple):
+    """Pose a motion after the state."""
+
+    R: Mat3
+    """R'."""
+    X: Vec3
+    """X'."""
+    T: Mat6
+    """Derivative of delta by x_v."""
+
+
+@inlined
+def pose_after(x: Floats, motion: Motion) -> EulerPoseAfter:
+    """R', X' and T of the pose a motion after the state."""
+    dR = mat(motion.dR)
+    dp = vec(motion.dp)
+    R = rotation_from_euler(x[ROLL], x[PITCH], x[YAW])
+    W = body_rates_from_euler(x[ROLL], x[PITCH])
+    R_after = R @ dR
+    T = Mat6(O3, dR.T @ W, R_after.T, -1.0 * (dR.T @ skew(dp) @ W))
+    return EulerPoseAfter(R_after, vec(x) + R @ dp, T)
+
+
 @compiled
-def pose_after(x: Floats, motion: Motion) -> tuple[Floats, Floats, Floats]:
-    """R' (3, 3), X' (3,) and T (6, 6) of the pose a motion after the state."""
-    R = rotation_from_euler(x[ROLL:POSE])
-    W = body_rates_from_euler(x[ROLL:POSE])
-    R_after = R @ motion.dR
-    T = np.zeros((6, POSE))
-    T[:3, 3:] = motion.dR.T @ W
-    T[3:, :3] = R_after.T
-    T[3:, 3:] = -motion.dR.T @ cross_matrix(motion.dp) @ W
-    return R_after, x[:3] + R @ motion.dp, T
+def pose_arrays(x: Floats, motion: Motion) -> tuple[Floats, Floats, Floats]:
+    """`pose_after` as arrays, shapes (3, 3), (3,) and (6, 6)."""
+    after = pose_after(x, motion)
+    R = np.empty((3, 3))
+    T = np.empty((6, 6))
+    store(after.R, R)
+    store_all(after.T, T)
+    return R, np.array([after.X.x, after.X.y, after.X.z]), T
+
+
+@compiled
+def pose_estimate(x: Floats, P: Floats, motion: Motion) -> tuple[Floats, Floats, Floats]:
+    """R', X' and the covariance ``T P_vv T^T + C`` of delta, shapes (3, 3), (3,) and (6, 6)."""
+    after = pose_after(x, motion)
+    R = np.empty((3, 3))
+    covariance = np.empty((6, 6))
+    store(after.R, R)
+    store6(after.T @ mat6(P) @ after.T.T + mat6(motion.C), covariance)
+    return R, np.array([after.X.x, after.X.y, after.X.z]), covariance
 
 
 @compiled
 def predict(x: Floats, P: Floats, motion: Motion) -> None:
     """Carry state and covariance over a motion: ``P_vv <- F P_vv F^T + G C G^T``, ``P_vm <- F P_vm``."""
     R, X, T = pose_after(x, motion)
-    x[:3] = X
-    x[ROLL:POSE] = euler_from_rotation(R)
-    E = np.linalg.inv(body_rates_from_euler(x[ROLL:POSE]))
-    G = np.zeros((POSE, 6))  # of x_v by delta
-    G[:3, 3:] = R
-    G[3:, :3] = E
+    angles = euler_from_rotation(R)
+    store_vector(X, x, 0)
+    store_vector(angles, x, ROLL)
+    E = euler_rates_from_body(angles.x, angles.y)
+    G = Mat6(O3, R, E, O3)  # of x_v by delta
     F = G @ T
-    P_vv = P[:POSE, :POSE].copy()
-    P_vm = F @ P[:POSE, POSE:].copy()
-    P[:POSE, :POSE] = symmetric(F @ P_vv @ F.T + G @ motion.C @ G.T)
-    P[:POSE, POSE:] = P_vm
-    P[POSE:, :POSE] = P_vm.T
+    P_vv = mat6(P)
+    store6(F @ P_vv @ F.T + G @ mat6(motion.C) @ G.T, P)
+    for j in range(POSE, len(x)):
+        P_vm_j = Vec6(Vec3(P[0, j], P[1, j], P[2, j]), Vec3(P[3, j], P[4, j], P[5, j]))  # column j
+        store_row6(F @ P_vm_j, P, j, 0)
+        for i in range(POSE):
+            P[i, j] = P[j, i]
 
 
 # -------------------------------------------------------------------------------- update
@@ -146,13 +207,14 @@ def observe(
 ) -> tuple[int, Floats, Floats]:
     """Update by range and azimuth of a known landmark at ``x[at : at + 3]``; outcome, e of (7) and S."""
     R, X, T = pose_after(x, motion)
-    z_hat, H_b, H_p = view_from_body(R, X, sonar.mount, x[at : at + LANDMARK])  # (6)
-    e = z - z_hat  # (7)
-    e[1] = wrap_angle(e[1])
+    sight = sight_of(R, X, sonar.mount, Vec3(x[at], x[at + 1], x[at + 2]))  # (6)
+    e = np.array([z[0] - sight.range_m, wrap_angle(z[1] - sight.azimuth_rad)])  # (7)
     H = np.zeros((2, len(x)))
-    H[:, :POSE] = H_b @ T
-    H[:, at : at + LANDMARK] = H_p
-    noise = H_b @ motion.C @ H_b.T + R_z
+    store_row6(T.T @ sight.range_by_body, H, 0, 0)
+    store_row6(T.T @ sight.azimuth_by_body, H, 1, 0)
+    store_row(sight.range_by_point, H, 0, at)
+    store_row(sight.azimuth_by_point, H, 1, at)
+    noise = R_z + motion_noise(sight.range_by_body, sight.azimuth_by_body, motion)
     S = symmetric(H @ P @ H.T + noise)
     outcome, widened = judged(e, S, R_z, sonar.gate, sonar.kernel_width)
     if outcome != GATED:
@@ -164,11 +226,12 @@ def observe(
 def update_depth(x: Floats, P: Floats, motion: Motion, port: Floats, z_m: float, variance_m2: float) -> None:
     """Update by the height of the pressure port, ``(X' + R' q)_z``."""
     R, X, T = pose_after(x, motion)
-    H_b = body_point_jacobian(R, port)[2:]  # (1, 6)
+    q = vec(port)
+    h_b = Vec6(cross(q, R.z), R.z)  # of the height by delta
     H = np.zeros((1, len(x)))
-    H[:, :POSE] = H_b @ T
-    e = z_m - (X + R @ port)[2:]
-    update(x, P, H, e, H_b @ motion.C @ H_b.T + variance_m2)
+    store_row6(T.T @ h_b, H, 0, 0)
+    e = np.array([z_m - X.z - R.z @ q])
+    update(x, P, H, e, np.array([[h_b @ (mat6(motion.C) @ h_b) + variance_m2]]))
 
 
 class EkfSlamParams(FilterParams):
@@ -208,11 +271,11 @@ class EkfSlam(FilterShell):
     def __init__(self, calibration: Calibration, odometry: MotionSource, params: EkfSlamParams | None = None) -> None:
         super().__init__(calibration, odometry, params or EkfSlamParams())
         start = calibration.start
-        R = np.ascontiguousarray(start.pose().rotation().matrix())
+        angles = euler_from_rotation(mat(start.pose().rotation().matrix()))
         self._x = np.zeros(MAP)
         self._x[:3] = start.position_m
-        self._x[ROLL:POSE] = euler_from_rotation(R)
-        E = np.linalg.inv(body_rates_from_euler(self._x[ROLL:POSE]))
+        self._x[ROLL:POSE] = angles
+        E = np.array(euler_rates_from_body(angles.x, angles.y))
         self._P = np.zeros((MAP, MAP))
         self._P[:3, :3] = np.diag(np.square(start.position_sigma_m))
         self._P[ROLL:POSE, ROLL:POSE] = E @ np.diag(np.square(start.rpy_sigma_rad)) @ E.T
@@ -237,7 +300,7 @@ class EkfSlam(FilterShell):
         P = self._P
         sonar = self.sonar
         at = MAP + LANDMARK * slot
-        R, X, T = pose_after(x, motion)
+        R, X, T = pose_arrays(x, motion)
         g, G_b, G_z = locate_from_body(R, X, sonar.mount, z, 0.0)
         e = g - x[at : at + LANDMARK]
         H = np.zeros((LANDMARK, len(x)))
@@ -256,7 +319,7 @@ class EkfSlam(FilterShell):
         x = self._x
         P = self._P
         sonar = self.sonar
-        R, X, T = pose_after(x, motion)
+        R, X, T = pose_arrays(x, motion)
         p, G_b, G_z = locate_from_body(R, X, sonar.mount, z, elevation_of_new(R, X, sonar, z))
         G_v = G_b @ T
         P_pv = G_v @ P[:POSE]  # (3, n)
@@ -275,7 +338,7 @@ class EkfSlam(FilterShell):
         """Update by a compass, ``psi' + c``, with Huber's kernel."""
         x = self._x
         P = self._P
-        R, _, T = pose_after(x, motion)
+        R, _, T = pose_arrays(x, motion)
         yaw, by_turn = yaw_and_derivative(R)
         H_b = np.array([[*by_turn, 0.0, 0.0, 0.0]])
         H = np.zeros((1, len(x)))
@@ -293,7 +356,7 @@ class EkfSlam(FilterShell):
         """Update by the position of the antenna, ``X' + R' q``, with Huber's kernel."""
         x = self._x
         P = self._P
-        R, X, T = pose_after(x, motion)
+        R, X, T = pose_arrays(x, motion)
         H_b = body_point_jacobian(R, self.antenna)  # (3, 6)
         H = np.zeros((3, len(x)))
         H[:, :POSE] = H_b @ T
@@ -322,8 +385,7 @@ class EkfSlam(FilterShell):
 
     def pose_after(self, motion: Motion) -> tuple[Floats, Floats, Floats]:
         """world_R_body (3, 3), position (3,), and covariance of [theta, rho] (6, 6) a motion after the state."""
-        R, X, T = pose_after(self._x, motion)
-        return R, X, symmetric(T @ self._P[:POSE, :POSE] @ T.T + motion.C)
+        return pose_estimate(self._x, self._P, motion)
 
     def landmark(self, slot: int) -> tuple[Floats, Floats]:
         """Position, and its block of (5)."""
@@ -332,10 +394,10 @@ class EkfSlam(FilterShell):
 
     def attitude(self) -> Floats:
         """world_R_body of the state, shape (3, 3)."""
-        return rotation_from_euler(self._x[ROLL:POSE])
+        return np.array(rotation_from_euler(*self._x[ROLL:POSE].tolist()))
 
     def check(self, epoch_ns: int) -> None:
-        """Note a state whose Euler angles are singular; the next prediction reads them from the rotation."""
+        """Note a state whose Euler angles are singular; the prediction from it reads them from the rotation."""
         if abs(self._x[PITCH]) >= MOST_PITCH_RAD and not self._overturned:
             self._overturned = [
                 f"pitch came to {math.degrees(self._x[PITCH]):.0f} deg, first at {epoch_ns} ns, where the Euler angles"

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.models import ACCEPTED, Mount, floor_elevation
-from sonar_graph.numerics import compiled, cross_matrix, rotation_exp
+from sonar_graph.numerics import LOWER_LEFT, compiled, cross, exp_and_mean, mat, store, store_vector, vec
 
 EPOCH, DEPTH, HEADING, FIX, FRAME, END = range(6)
 """Kinds of events; at equal stamps the lower comes first."""
@@ -188,12 +188,18 @@ def remove_rate(motion: Motion, bias: Floats, earth: Floats) -> Motion:
     For gyros the Earth's rate is a bias, the mean of its values in frames i and j. The specific force turns by half of
     the correction of the rotation.
     """
-    dR, dp, C, D, impulse = motion
-    rate = bias + 0.5 * (earth + dR.T @ earth)
-    theta = D[:3] @ rate
-    rho = D[3:] @ rate
-    impulse = impulse + 0.5 * cross_matrix(dR @ theta) @ impulse
-    return Motion(dR @ rotation_exp(theta), dp + dR @ rho, C, D, impulse)
+    dR = mat(motion.dR)
+    impulse = vec(motion.impulse)
+    earth_i = vec(earth)
+    rate = vec(bias) + 0.5 * (earth_i + dR.T @ earth_i)
+    theta = mat(motion.D) @ rate
+    rho = mat(motion.D, LOWER_LEFT) @ rate
+    turn, _ = exp_and_mean(theta)
+    reduced = Motion(np.empty((3, 3)), np.empty(3), motion.C, motion.D, np.empty(3))
+    store(dR @ turn, reduced.dR)
+    store_vector(vec(motion.dp) + dR @ rho, reduced.dp, 0)
+    store_vector(impulse + 0.5 * cross(dR @ theta, impulse), reduced.impulse, 0)
+    return reduced
 
 
 def elevation_of_new(R: Floats, X: Floats, sonar: Sonar, z: Floats) -> float:

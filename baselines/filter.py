@@ -220,7 +220,7 @@ class FilterShell(ABC):
         """world_R_body of the state, shape (3, 3)."""
 
     def check(self, epoch_ns: int) -> None:
-        """Look at the state after an event; nothing by default."""
+        """Look at the state after all measurements at an epoch; nothing by default."""
         del epoch_ns
 
     def gyro_bias(self) -> Floats:
@@ -418,7 +418,6 @@ class FilterShell(ABC):
             elif kind == FIX:
                 distance = self.update_position(motion, samples.value[row], samples.noise[row])
                 self._contradictions.judge("positions", distance)
-            self.check(self.node_ns)
         R, X, covariance = self.pose_after(motion)
         self.odometry.settle(self.node_ns)
         if self.node_ns > self._kept_ns + KEPT_NS:
@@ -434,6 +433,7 @@ class FilterShell(ABC):
 
     def _to_epoch(self, motion: Motion, epoch_ns: int, *, ends_interval: bool) -> None:
         """Predict to an epoch, and correct there by the plane, and by gravity where an interval of it ends."""
+        self.check(self.node_ns)
         self.predict(motion, (epoch_ns - self.node_ns) * 1e-9)
         self.node_ns = epoch_ns
         self._impulse = self._impulse + self._turned @ motion.impulse

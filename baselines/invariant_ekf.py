@@ -56,6 +56,7 @@ from baselines.kalman import (
     distance,
     judged,
     judged_far,
+    motion_noise,
     polar_covariance,
     stands_on_floor,
     symmetric,
@@ -73,12 +74,30 @@ from sonar_graph.models import (
     gyro_bias_of,
     huber_scale,
     locate_from_body,
-    view_from_body,
+    sight_of,
     wrap_angle,
     yaw_and_derivative,
 )
 from sonar_graph.motion import MotionSource
-from sonar_graph.numerics import compiled, cross_matrix, left_jacobian, rotation_exp
+from sonar_graph.numerics import (
+    UPPER_RIGHT,
+    ZERO,
+    Mat3,
+    Vec3,
+    Vec6,
+    compiled,
+    cross,
+    cross_matrix,
+    exp_and_mean,
+    inlined,
+    mat,
+    mat6,
+    skew,
+    store,
+    store_row,
+    store_vector,
+    vec,
+)
 
 THETA, BETA, BODY = slice(0, 3), slice(3, 3 + BIASES), slice(3 + BIASES, 6 + BIASES)
 """Places of theta, beta and xi_0 in xi."""
@@ -114,19 +133,38 @@ def place_of(k: int) -> slice:
 # -------------------------------------------------------------------------------- prediction
 
 
-@compiled
-def up_in_body(state: InvariantState) -> Floats:
-    """The world's up in the body as it splits the gyros' bias, shape (3,); zero without gravity."""
-    return state.R[2].copy() if state.is_level else np.zeros(3)
+class InvariantPoseAfter(NamedTuple):
+    """Pose a motion after the state, (2)."""
+
+    R: Mat3
+    """R'."""
+    X: Vec3
+    """X', without the scale error of the Doppler log."""
+    D: Floats
+    """Derivative of the motion by b, shape (6, 11)."""
+
+
+@inlined
+def pose_after(state: InvariantState, motion: Motion) -> InvariantPoseAfter:
+    """R', X' of (2), and D."""
+    R = mat(state.R)
+    dR = mat(motion.dR)
+    dp = vec(motion.dp)
+    up = R.z if state.is_level else ZERO  # splits the gyros' bias
+    D = bias_jacobian(motion.D, dR, dp, up, R.z, vec(state.body_p_dvl))
+    scaled = state.bias[SCALE] * Vec3(D[3, SCALE], D[4, SCALE], D[5, SCALE])
+    R_after = R @ dR
+    X = vec(state.points[0]) + R @ dp + R_after @ scaled
+    return InvariantPoseAfter(R_after, X, D)
 
 
 @compiled
-def pose_after(state: InvariantState, motion: Motion) -> tuple[Floats, Floats, Floats]:
-    """R' (3, 3) and X' (3,) of (2), without the scale error of the Doppler log, and D (6, 11)."""
-    D = bias_jacobian(motion.D, motion.dR, motion.dp, up_in_body(state), state.R[2], state.body_p_dvl)
-    R = state.R @ motion.dR
-    X = state.points[0] + state.R @ motion.dp + R @ (D[3:, SCALE] * state.bias[SCALE])
-    return R, X, D
+def pose_arrays(state: InvariantState, motion: Motion) -> tuple[Floats, Floats, Floats]:
+    """`pose_after` as arrays, shapes (3, 3), (3,) and (6, 11)."""
+    after = pose_after(state, motion)
+    R = np.empty((3, 3))
+    store(after.R, R)
+    return R, np.array([after.X.x, after.X.y, after.X.z]), after.D
 
 
 @compiled
@@ -136,14 +174,15 @@ def predict(state: InvariantState, motion: Motion, walk_variance: Floats) -> Non
     ``walk_variance``: of the biases since, shape (11,).
     """
     R, X, D = pose_after(state, motion)
-    state.R[:] = R
-    state.points[0] = X
+    store(R, state.R)
+    store_vector(X, state.points[0], 0)
     P = state.P
     J = np.zeros((len(P), 6))
-    J[THETA, :3] = R
-    J[BODY, 3:] = R
+    store(R, J)  # theta
+    store(R, J[BODY], UPPER_RIGHT)
     for k in range(len(state.points)):
-        J[BODY.start + POINT * k : BODY.stop + POINT * k, :3] = cross_matrix(state.points[k]) @ R
+        x_k = vec(state.points[k])
+        store(skew(x_k) @ R, J[BODY.start + POINT * k :])
     JD = J @ D
     # F P F^T = P + M + M^T, with half of what is quadratic in J in M
     M = JD @ (P[BETA] + 0.5 * P[BETA, BETA].copy() @ JD.T) + J @ (0.5 * motion.C @ J.T)
@@ -159,10 +198,21 @@ def predict(state: InvariantState, motion: Motion, walk_variance: Floats) -> Non
 def update(state: InvariantState, H: Floats, e: Floats, R: Floats) -> None:
     """Update by an innovation: ``xi = K e`` moves the estimate by (1), ``P <- P - K S K^T``."""
     xi = correction(state.P, H, e, R)
-    Exp = rotation_exp(xi[THETA])
-    state.R[:] = Exp @ state.R
-    state.points[:] = state.points @ Exp.T + xi[BODY.start :].reshape(-1, POINT) @ left_jacobian(xi[THETA]).T
-    state.bias[:] += xi[BETA]
+    Exp, J_l = exp_and_mean(vec(xi))
+    store(Exp @ mat(state.R), state.R)
+    for k in range(len(state.points)):
+        xi_k = vec(xi[BODY.start + POINT * k :])
+        store_vector(Exp @ vec(state.points[k]) + J_l @ xi_k, state.points[k], 0)
+    for i in range(BIASES):
+        state.bias[i] += xi[BETA.start + i]
+
+
+@inlined
+def store_by_biases(h_b: Vec6, D: Floats, H: Floats, row: int) -> None:
+    """Write ``H_beta = H_b D`` of (4) into a row of H."""
+    for i in range(BIASES):
+        D_i = Vec6(Vec3(D[0, i], D[1, i], D[2, i]), Vec3(D[3, i], D[4, i], D[5, i]))
+        H[row, BETA.start + i] = h_b @ D_i
 
 
 @compiled
@@ -172,14 +222,16 @@ def observe(
     """Update by range and azimuth of a known landmark, (5); outcome, innovation and its covariance."""
     at = BODY.start + POINT * k
     R, X, D = pose_after(state, motion)
-    z_hat, H_b, H_p = view_from_body(R, X, sonar.mount, state.points[k])
-    e = z - z_hat
-    e[1] = wrap_angle(e[1])
+    sight = sight_of(R, X, sonar.mount, vec(state.points[k]))
+    e = np.array([z[0] - sight.range_m, wrap_angle(z[1] - sight.azimuth_rad)])
     H = np.zeros((2, len(state.P)))
-    H[:, at : at + POINT] = H_p
-    H[:, BODY] = -H_p
-    H[:, BETA] = H_b @ D  # (4)
-    noise = H_b @ motion.C @ H_b.T + R_z
+    store_row(sight.range_by_point, H, 0, at)
+    store_row(sight.azimuth_by_point, H, 1, at)
+    store_row(-1.0 * sight.range_by_point, H, 0, BODY.start)
+    store_row(-1.0 * sight.azimuth_by_point, H, 1, BODY.start)
+    store_by_biases(sight.range_by_body, D, H, 0)
+    store_by_biases(sight.azimuth_by_body, D, H, 1)
+    noise = R_z + motion_noise(sight.range_by_body, sight.azimuth_by_body, motion)
     S = symmetric(H @ state.P @ H.T + noise)  # (9)
     outcome, widened = judged(e, S, R_z, sonar.gate, sonar.kernel_width)
     if outcome != GATED:
@@ -188,24 +240,18 @@ def observe(
 
 
 @compiled
-def position_jacobian(state: InvariantState, a: Floats, H_b: Floats, D: Floats) -> Floats:
-    """H of the position a of a point of the body, (7), shape (3, 17 + 3 N)."""
-    H = np.zeros((3, len(state.P)))
-    H[:, THETA] = -cross_matrix(a)
-    H[:, BODY] = np.eye(3)
-    H[:, BETA] = H_b @ D  # (4)
-    return H
-
-
-@compiled
 def update_depth(state: InvariantState, motion: Motion, port: Floats, z_m: float, variance_m2: float) -> None:
     """Update by the height of the pressure port, (7)."""
     R, X, D = pose_after(state, motion)
-    a = X + R @ port
-    H_b = body_point_jacobian(R, port)
-    H = position_jacobian(state, a, H_b, D)[2:]
-    H_b = H_b[2:]  # (1, 6)
-    update(state, H, z_m - a[2:], H_b @ motion.C @ H_b.T + variance_m2)
+    q = vec(port)
+    a = X + R @ q
+    h_b = Vec6(cross(q, R.z), R.z)  # by eps
+    H = np.zeros((1, len(state.P)))
+    store_row(Vec3(a.y, -a.x, 0.0), H, 0, THETA.start)
+    H[0, BODY.start + 2] = 1.0
+    store_by_biases(h_b, D, H, 0)
+    e = np.array([z_m - a.z])
+    update(state, H, e, np.array([[h_b @ (mat6(motion.C) @ h_b) + variance_m2]]))
 
 
 class InvariantEkfParams(FilterParams):
@@ -277,7 +323,7 @@ class InvariantEkf(FilterShell):
         """
         state = self._state
         sonar = self.sonar
-        R, X, D = pose_after(state, motion)
+        R, X, D = pose_arrays(state, motion)
         g, G_b, G_z = locate_from_body(R, X, sonar.mount, z, 0.0)
         e = g - state.points[1 + slot]
         H = np.zeros((POINT, len(state.P)))
@@ -293,7 +339,7 @@ class InvariantEkf(FilterShell):
         """Append a landmark, (6), on a floor of known height if it is near."""
         state = self._state
         sonar = self.sonar
-        R, X, D = pose_after(state, motion)
+        R, X, D = pose_arrays(state, motion)
         g, G_b, G_z = locate_from_body(R, X, sonar.mount, z, elevation_of_new(R, X, sonar, z))
         G = np.zeros((POINT, len(state.P)))
         G[:, BODY] = np.eye(3)
@@ -315,7 +361,7 @@ class InvariantEkf(FilterShell):
     def update_heading(self, motion: Motion, yaw_rad: float, variance_rad2: float) -> float:
         """Update by a compass, (10), with Huber's kernel."""
         state = self._state
-        R, _, D = pose_after(state, motion)
+        R, _, D = pose_arrays(state, motion)
         yaw, by_turn = yaw_and_derivative(R)
         H_b = np.array([[*by_turn, 0.0, 0.0, 0.0]])
         H = np.zeros((1, len(state.P)))
@@ -333,10 +379,13 @@ class InvariantEkf(FilterShell):
     def update_position(self, motion: Motion, position_m: Floats, cov_m2: Floats) -> float:
         """Update by the position of the antenna, (7), with Huber's kernel."""
         state = self._state
-        R, X, D = pose_after(state, motion)
+        R, X, D = pose_arrays(state, motion)
         a = X + R @ self.antenna
         H_b = body_point_jacobian(R, self.antenna)
-        H = position_jacobian(state, a, H_b, D)
+        H = np.zeros((3, len(state.P)))
+        H[:, THETA] = -cross_matrix(a)
+        H[:, BODY] = np.eye(3)
+        H[:, BETA] = H_b @ D  # (4)
         e = position_m - a
         noise = H_b @ motion.C @ H_b.T
         S = symmetric(H @ state.P @ H.T + noise + cov_m2)  # (9)
@@ -387,7 +436,7 @@ class InvariantEkf(FilterShell):
 
         The error of the state is there ``[R'^T theta; R'^T (xi_0 - [X']x theta)]``, to which ``D beta + eps`` is added.
         """
-        R, X, D = pose_after(self._state, motion)
+        R, X, D = pose_arrays(self._state, motion)
         A = np.zeros((6, BARE))
         A[:3, THETA] = R.T
         A[3:, BODY] = R.T

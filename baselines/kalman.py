@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from baselines.events import Sonar
+from baselines.events import Motion, Sonar
 from sonar_graph.measurements import Floats
 from sonar_graph.models import FLOOR_GATE
-from sonar_graph.numerics import compiled
+from sonar_graph.numerics import Vec6, compiled, inlined, mat6
 from sonar_graph.states import OUTCOME_NUMBERS, Outcome
 
 USED = OUTCOME_NUMBERS[Outcome.USED]
@@ -51,6 +51,19 @@ def correction(P: Floats, H: Floats, e: Floats, R: Floats) -> Floats:
 def symmetric(A: Floats) -> Floats:
     """``(A + A^T) / 2``."""
     return 0.5 * (A + A.T)
+
+
+@inlined
+def motion_noise(range_by_body: Vec6, azimuth_by_body: Vec6, motion: Motion) -> Floats:
+    """``H_b C H_b^T``, shape (2, 2), of the rows of H_b."""
+    C = mat6(motion.C)
+    across = range_by_body @ (C @ azimuth_by_body)
+    return np.array(
+        [
+            [range_by_body @ (C @ range_by_body), across],
+            [across, azimuth_by_body @ (C @ azimuth_by_body)],
+        ]
+    )
 
 
 @compiled

@@ -13,7 +13,19 @@ import numpy as np
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Floats
-from sonar_graph.numerics import compiled
+from sonar_graph.numerics import (
+    LOWER_LEFT,
+    LOWER_RIGHT,
+    UPPER_RIGHT,
+    Mat3,
+    Vec3,
+    compiled,
+    inlined,
+    mat,
+    outer,
+    store,
+    vec,
+)
 
 TILT, HEADING, ACCEL, COMPASS, SCALE, BIASES = slice(0, 3), slice(3, 6), slice(6, 9), 9, 10, 11
 """Places in b of the gyros' bias (rad/s), twice, that of the accelerometers (m/s²) and of the compass (rad), and the
@@ -31,19 +43,19 @@ def bias_sigmas(calibration: Calibration) -> tuple[Floats, Floats]:
     return sigmas, np.where(sigmas > 0, walks, 0.0)
 
 
-@compiled
 def gyro_bias_of(b: Floats, up: Floats) -> Floats:
     """Gyro bias in body axes, shape (3,), where the world's up lies along ``up`` in the body; zero without gravity."""
-    return b[TILT] + up * np.sum(up * (b[HEADING] - b[TILT]))
-
-
-def by_biases(D: Floats, dR: Floats, dp: Floats, up: Floats, vertical: Floats, body_p_dvl: Floats) -> Floats:
-    """`bias_jacobian` of arrays in any memory layout."""
-    return bias_jacobian(*(np.ascontiguousarray(part) for part in (D, dR, dp, up, vertical, body_p_dvl)))
+    return b[TILT] + up * (up @ (b[HEADING] - b[TILT]))
 
 
 @compiled
-def bias_jacobian(D: Floats, dR: Floats, dp: Floats, up: Floats, vertical: Floats, body_p_dvl: Floats) -> Floats:
+def by_biases(D: Floats, dR: Floats, dp: Floats, up: Floats, vertical: Floats, body_p_dvl: Floats) -> Floats:
+    """`bias_jacobian` of arrays."""
+    return bias_jacobian(D, mat(dR), vec(dp), vec(up), vec(vertical), vec(body_p_dvl))
+
+
+@inlined
+def bias_jacobian(D: Floats, dR: Mat3, dp: Vec3, up: Vec3, vertical: Vec3, body_p_dvl: Vec3) -> Floats:
     """Derivative of a motion's [theta, rho] by b, shape (6, 11), from that by the gyro bias, ``D``, shape (6, 3).
 
     By b_heading the body turns about the world's vertical alone, whatever its tilt meanwhile: ``u_j u_j^T D_theta``,
@@ -55,16 +67,25 @@ def bias_jacobian(D: Floats, dR: Floats, dp: Floats, up: Floats, vertical: Float
     dR, dp
         Mean of the motion.
     up
-        The world's up in the body at its start, shape (3,); zero without gravity.
+        The world's up in the body at its start; zero without gravity.
     vertical
         The same, with or without gravity.
     """
     up_j = dR.T @ up
     vertical_j = dR.T @ vertical
-    D_b = np.zeros((6, BIASES))
-    D_b[:3, HEADING] = np.outer(up_j, D[:3].T @ up_j)
-    D_b[3:, HEADING] = np.outer(D[3:] @ up, up)
-    D_b[:, TILT] = D - D_b[:, HEADING]
+    D_theta = mat(D)
+    D_rho = mat(D, LOWER_LEFT)
+    theta_by_heading = outer(up_j, D_theta.T @ up_j)
+    rho_by_heading = outer(D_rho @ up, up)
     way = dR.T @ (body_p_dvl - dp) - body_p_dvl
-    D_b[3:, SCALE] = way - vertical_j * (vertical_j @ way)
+    level_way = way - (vertical_j @ way) * vertical_j
+    D_b = np.zeros((6, BIASES))
+    # b_tilt in the columns 0 to 2, b_heading in 3 to 5
+    store(D_theta - theta_by_heading, D_b)
+    store(D_rho - rho_by_heading, D_b, LOWER_LEFT)
+    store(theta_by_heading, D_b, UPPER_RIGHT)
+    store(rho_by_heading, D_b, LOWER_RIGHT)
+    D_b[3, SCALE] = level_way.x
+    D_b[4, SCALE] = level_way.y
+    D_b[5, SCALE] = level_way.z
     return D_b

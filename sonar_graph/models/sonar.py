@@ -26,7 +26,22 @@ import gtsam
 import numpy as np
 
 from sonar_graph.measurements import Floats
-from sonar_graph.numerics import compiled, cross_matrix
+from sonar_graph.numerics import (
+    UPPER_RIGHT,
+    Mat3,
+    Vec3,
+    Vec6,
+    compiled,
+    cross,
+    cross_matrix,
+    inlined,
+    mat,
+    skew,
+    store,
+    store_row,
+    store_row6,
+    vec,
+)
 
 FLOOR_GATE = 10.83
 """Gate for "the landmark stands on the floor": the 0.999 quantile of chi-square with one degree of freedom.
@@ -45,67 +60,123 @@ def wrap_angle(angle_rad: Angle) -> Angle:
     return angle_rad - 2.0 * math.pi * turns
 
 
-@compiled
-def project(q: Floats) -> tuple[Floats, Floats]:
-    """(range m, azimuth rad), shape (2,), of a point in the sonar frame, and D_q, shape (2, 3)."""
-    x = q[0]
-    y = q[1]
-    h2 = x * x + y * y
-    range_m = math.sqrt(h2 + q[2] * q[2])
-    D_q = np.zeros((2, 3))
-    D_q[0, 0] = x / range_m
-    D_q[0, 1] = y / range_m
-    D_q[0, 2] = q[2] / range_m
-    D_q[1, 0] = -y / h2
-    D_q[1, 1] = x / h2
-    return np.array([range_m, math.atan2(y, x)]), D_q
+class Polar(NamedTuple):
+    """Range and azimuth of a point q in the sonar frame, and the rows of D_q."""
+
+    range_m: float
+    azimuth_rad: float
+    range_by_q: Vec3
+    azimuth_by_q: Vec3
+
+
+@inlined
+def polar(q: Vec3) -> Polar:
+    """Range, azimuth and D_q of a point in the sonar frame."""
+    h2 = q.x * q.x + q.y * q.y
+    range_m = math.sqrt(h2 + q.z * q.z)
+    return Polar(
+        range_m=range_m,
+        azimuth_rad=math.atan2(q.y, q.x),
+        range_by_q=Vec3(q.x / range_m, q.y / range_m, q.z / range_m),
+        azimuth_by_q=Vec3(-q.y / h2, q.x / h2, 0.0),
+    )
 
 
 @compiled
 def project_points(q: Floats) -> tuple[Floats, Floats]:
-    """`project` of m points in the sonar frame, shape (m, 3): shapes (m, 2) and (m, 2, 3)."""
+    """(range m, azimuth rad) of m points in the sonar frame, shape (m, 3): shape (m, 2), and D_q, (m, 2, 3)."""
     z = np.empty((len(q), 2))
     D_q = np.empty((len(q), 2, 3))
     for k in range(len(q)):
-        z[k], D_q[k] = project(q[k])
+        seen = polar(Vec3(q[k, 0], q[k, 1], q[k, 2]))
+        z[k, 0] = seen.range_m
+        z[k, 1] = seen.azimuth_rad
+        store_row(seen.range_by_q, D_q[k], 0, 0)
+        store_row(seen.azimuth_by_q, D_q[k], 1, 0)
     return z, D_q
 
 
-class View(NamedTuple):
+def project(q: Floats) -> tuple[Floats, Floats]:
+    """`project_points` of one point, shape (3,): shapes (2,) and (2, 3)."""
+    z, D_q = project_points(np.ascontiguousarray(q)[None])
+    return z[0], D_q[0]
+
+
+class Mount(NamedTuple):
+    """Sonar in the body, as arrays."""
+
+    body_R_sonar: Floats
+    body_p_sonar: Floats
+
+
+class Sight(NamedTuple):
+    """Range and azimuth of a point of the world from a body, and their derivatives.
+
+    ``_by_body``: by the right perturbation [theta, rho] of the body's pose; ``_by_point``: by the point.
+    """
+
+    range_m: float
+    azimuth_rad: float
+    range_by_body: Vec6
+    azimuth_by_body: Vec6
+    range_by_point: Vec3
+    azimuth_by_point: Vec3
+
+
+@inlined
+def sight_of(R: Mat3, X: Vec3, mount: Mount, p: Vec3) -> Sight:
+    """Range and azimuth of a point p of the world from a body at ``world_T_body = (R, X)``."""
+    body_R_sonar = mat(mount.body_R_sonar)
+    q = R.T @ (p - X)  # in body axes
+    seen = polar(body_R_sonar.T @ (q - vec(mount.body_p_sonar)))
+    # derivatives n by q; the body's perturbation moves q by [q]x theta - rho
+    range_n = body_R_sonar @ seen.range_by_q
+    azimuth_n = body_R_sonar @ seen.azimuth_by_q
+    return Sight(
+        range_m=seen.range_m,
+        azimuth_rad=seen.azimuth_rad,
+        range_by_body=Vec6(cross(range_n, q), -1.0 * range_n),
+        azimuth_by_body=Vec6(cross(azimuth_n, q), -1.0 * azimuth_n),
+        range_by_point=R @ range_n,
+        azimuth_by_point=R @ azimuth_n,
+    )
+
+
+class PointViews(NamedTuple):
     """Expected range and azimuth of m points of the world, with derivatives."""
 
     z: Floats
     """Range (m) and azimuth (rad), shape (m, 2)."""
-    by_sonar: Floats
-    """Derivative by the right perturbation [theta, rho] of the sonar's pose, shape (m, 2, 6)."""
+    by_pose: Floats
+    """Derivative by the right perturbation [theta, rho] of the pose, shape (m, 2, 6)."""
     by_point: Floats
     """Derivative by the points, shape (m, 2, 3)."""
 
 
 @compiled
-def _view(points: Floats, R: Floats, t: Floats) -> tuple[Floats, Floats, Floats]:
+def views_from_body(R: Floats, X: Floats, mount: Mount, points: Floats) -> PointViews:
+    """`sight_of` of m points of the world, shape (m, 3), as arrays."""
     m = len(points)
     z = np.empty((m, 2))
-    by_sonar = np.empty((m, 2, 6))
+    by_pose = np.empty((m, 2, 6))
     by_point = np.empty((m, 2, 3))
-    R_T = R.T.copy()
     for k in range(m):
-        q = R_T @ (points[k] - t)
-        z[k], D_q = project(q)
-        # D_q [q]x: the row of range is q^T [q]x / |q| = 0
-        by_sonar[k, 0, :3] = 0.0
-        by_sonar[k, 1, 0] = D_q[1, 1] * q[2]
-        by_sonar[k, 1, 1] = -D_q[1, 0] * q[2]
-        by_sonar[k, 1, 2] = -1.0
-        by_sonar[k, :, 3:] = -D_q
-        by_point[k] = D_q @ R_T
-    return z, by_sonar, by_point
+        sight = sight_of(mat(R), vec(X), mount, Vec3(points[k, 0], points[k, 1], points[k, 2]))
+        z[k, 0] = sight.range_m
+        z[k, 1] = sight.azimuth_rad
+        store_row6(sight.range_by_body, by_pose[k], 0, 0)
+        store_row6(sight.azimuth_by_body, by_pose[k], 1, 0)
+        store_row(sight.range_by_point, by_point[k], 0, 0)
+        store_row(sight.azimuth_by_point, by_point[k], 1, 0)
+    return PointViews(z, by_pose, by_point)
 
 
-def view_points(world_T_sonar: gtsam.Pose3, points: Floats) -> View:
-    """Expected range and azimuth of points of the world, shape (m, 3), and their derivatives."""
-    R = np.ascontiguousarray(world_T_sonar.rotation().matrix())
-    return View(*_view(np.ascontiguousarray(points), R, world_T_sonar.translation()))
+AT_SONAR = Mount(np.eye(3), np.zeros(3))
+
+
+def view_points(world_T_sonar: gtsam.Pose3, points: Floats) -> PointViews:
+    """Expected range and azimuth of points of the world, shape (m, 3), and derivatives, by the sonar's own pose."""
+    return views_from_body(*_as_arrays(world_T_sonar), AT_SONAR, np.ascontiguousarray(points))
 
 
 def range_azimuth(world_T_sonar: gtsam.Pose3, p_world: Floats) -> Floats:
@@ -116,45 +187,22 @@ def range_azimuth(world_T_sonar: gtsam.Pose3, p_world: Floats) -> Floats:
 def range_azimuth_jacobians(
     world_T_body: gtsam.Pose3, body_T_sonar: gtsam.Pose3, p_world: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Range and azimuth with derivatives, as `view_from_body`."""
-    R, X = _as_arrays(world_T_body)
-    return view_from_body(R, X, Mount(*_as_arrays(body_T_sonar)), np.ascontiguousarray(p_world))
+    """Range and azimuth of one point of the world, shape (2,), with derivatives.
+
+    These are by the right perturbation [theta, rho] of the body's pose, shape (2, 6), and by the point, shape (2, 3).
+    """
+    mount = Mount(*_as_arrays(body_T_sonar))
+    view = views_from_body(*_as_arrays(world_T_body), mount, np.ascontiguousarray(p_world)[None])
+    return view.z[0], view.by_pose[0], view.by_point[0]
 
 
 def _as_arrays(pose: gtsam.Pose3) -> tuple[Floats, Floats]:
     return np.ascontiguousarray(pose.rotation().matrix()), pose.translation()
 
 
-class Mount(NamedTuple):
-    """Sonar in the body, as arrays."""
-
-    body_R_sonar: Floats
-    body_p_sonar: Floats
-
-
-@compiled
 def body_point_jacobian(R: Floats, q: Floats) -> Floats:
     """``R [-[q]x  I]``, shape (3, 6): a point q of the body moves so in the world by [theta, rho] of its pose."""
-    J = np.empty((3, 6))
-    J[:, :3] = -R @ cross_matrix(q)
-    J[:, 3:] = R
-    return J
-
-
-@compiled
-def view_from_body(R: Floats, X: Floats, mount: Mount, p: Floats) -> tuple[Floats, Floats, Floats]:
-    """Range and azimuth, shape (2,), of a point p of the world from a body at ``world_T_body = (R, X)``.
-
-    Returns as well their derivative by the right perturbation [theta, rho] of the body's pose, shape (2, 6), and by the
-    point, shape (2, 3).
-    """
-    q = R.T @ (p - X)  # in body axes
-    z, D_q = project(mount.body_R_sonar.T @ (q - mount.body_p_sonar))
-    N = D_q @ mount.body_R_sonar.T  # derivative by q, which moves by -[-[q]x  I] [theta; rho]
-    by_body = np.empty((2, 6))
-    by_body[:, :3] = N @ cross_matrix(q)
-    by_body[:, 3:] = -N
-    return z, by_body, N @ R.T
+    return np.hstack((-R @ cross_matrix(q), R))
 
 
 @compiled
@@ -166,35 +214,43 @@ def locate_from_body(
     Returns as well its derivative by the right perturbation [theta, rho] of the body's pose, shape (3, 6), and by
     (range, azimuth, elevation), shape (3, 3).
     """
-    q = mount.body_p_sonar + mount.body_R_sonar @ sonar_point(z[0], z[1], elevation_rad)  # in body axes
-    by_polar = R @ mount.body_R_sonar @ sonar_point_jacobian(z[0], z[1], elevation_rad)
-    return X + R @ q, body_point_jacobian(R, q), by_polar
+    world_R_body = mat(R)
+    body_R_sonar = mat(mount.body_R_sonar)
+    q = vec(mount.body_p_sonar) + body_R_sonar @ _point_at(z[0], z[1], elevation_rad)  # in body axes
+    p = vec(X) + world_R_body @ q
+    by_body = np.empty((3, 6))
+    store(-1.0 * (world_R_body @ skew(q)), by_body)
+    store(world_R_body, by_body, UPPER_RIGHT)
+    by_polar = np.empty((3, 3))
+    store(world_R_body @ body_R_sonar @ _point_jacobian(z[0], z[1], elevation_rad), by_polar)
+    return np.array([p.x, p.y, p.z]), by_body, by_polar
 
 
-@compiled
-def sonar_point(range_m: float, azimuth_rad: float, elevation_rad: float) -> Floats:
-    """The point in the sonar frame with these spherical coordinates, shape (3,), m."""
+@inlined
+def _point_at(range_m: float, azimuth_rad: float, elevation_rad: float) -> Vec3:
+    """The point in the sonar frame with these spherical coordinates."""
     level_m = range_m * math.cos(elevation_rad)
-    x = level_m * math.cos(azimuth_rad)
-    y = level_m * math.sin(azimuth_rad)
-    return np.array([x, y, range_m * math.sin(elevation_rad)])
+    return Vec3(level_m * math.cos(azimuth_rad), level_m * math.sin(azimuth_rad), range_m * math.sin(elevation_rad))
 
 
-@compiled
-def sonar_point_jacobian(range_m: float, azimuth_rad: float, elevation_rad: float) -> Floats:
-    """Derivative of `sonar_point` by (range, azimuth, elevation), shape (3, 3)."""
+@inlined
+def _point_jacobian(range_m: float, azimuth_rad: float, elevation_rad: float) -> Mat3:
+    """Derivative of `_point_at` by (range, azimuth, elevation)."""
     ca = math.cos(azimuth_rad)
     sa = math.sin(azimuth_rad)
     ce = math.cos(elevation_rad)
     se = math.sin(elevation_rad)
     r = range_m
-    return np.array(
-        [
-            [ce * ca, -r * ce * sa, -r * se * ca],
-            [ce * sa, r * ce * ca, -r * se * sa],
-            [se, 0.0, r * ce],
-        ]
+    return Mat3(
+        Vec3(ce * ca, -r * ce * sa, -r * se * ca),
+        Vec3(ce * sa, r * ce * ca, -r * se * sa),
+        Vec3(se, 0.0, r * ce),
     )
+
+
+def sonar_point(range_m: float, azimuth_rad: float, elevation_rad: float) -> Floats:
+    """The point in the sonar frame with these spherical coordinates, shape (3,), m."""
+    return np.array(_point_at(range_m, azimuth_rad, elevation_rad))
 
 
 def locate(world_T_sonar: gtsam.Pose3, range_m: float, azimuth_rad: float, elevation_rad: float) -> Floats:

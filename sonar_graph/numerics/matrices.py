@@ -76,6 +76,7 @@ RULES: dict[str, dict[tuple[type, type], Callable[[Any, Any], Any]]] = {
     "mul": {
         (float, Vec3): lambda a, b: Vec3(a * b.x, a * b.y, a * b.z),
         (float, Mat3): lambda a, b: Mat3(a * b.x, a * b.y, a * b.z),
+        (float, Vec6): lambda a, b: Vec6(a * b.a, a * b.b),
     },
     "matmul": {
         (Vec3, Vec3): lambda a, b: a.x * b.x + a.y * b.y + a.z * b.z,
@@ -116,7 +117,8 @@ extending.overload_attribute(types.NamedUniTuple, "T", **INLINE)(lambda a: TRANS
 ZERO = Vec3(0.0, 0.0, 0.0)
 O3 = Mat3(ZERO, ZERO, ZERO)
 I3 = Mat3(Vec3(1.0, 0.0, 0.0), Vec3(0.0, 1.0, 0.0), Vec3(0.0, 0.0, 1.0))
-Index = tuple[int | np.integer[Any], ...]
+Place = int | np.integer[Any]
+Index = tuple[Place, ...]
 UPPER_LEFT, UPPER_RIGHT, LOWER_LEFT, LOWER_RIGHT = itertools.product(np.arange(0, 6, 3), repeat=2)
 """First elements of the blocks of a 6 by 6 array; not literals, for each of which numba would compile anew."""
 
@@ -172,12 +174,44 @@ def mat6(A: Floats) -> Mat6:
 
 
 @inlined
+def store_vector(v: Vec3, out: Floats, at: int) -> None:
+    """Write a vector into an array of one dimension, its first element at a place."""
+    out[at] = v.x
+    out[at + 1] = v.y
+    out[at + 2] = v.z
+
+
+@inlined
+def store_row(v: Vec3, out: Floats, row: Place, column: Place) -> None:
+    """Write a vector into a row of an array, its first element at a column."""
+    out[row, column] = v.x
+    out[row, column + 1] = v.y
+    out[row, column + 2] = v.z
+
+
+@inlined
+def store_row6(v: Vec6, out: Floats, row: Place, column: Place) -> None:
+    """Write a vector of six into a row of an array, its first element at a column."""
+    store_row(v.a, out, row, column)
+    store_row(v.b, out, row, column + 3)
+
+
+@inlined
 def store(A: Mat3, out: Floats, at: Index = UPPER_LEFT) -> None:
     """Write a matrix into an array, its first element at a row and column."""
     r, c = at
-    out[r, c], out[r, c + 1], out[r, c + 2] = A.x.x, A.x.y, A.x.z
-    out[r + 1, c], out[r + 1, c + 1], out[r + 1, c + 2] = A.y.x, A.y.y, A.y.z
-    out[r + 2, c], out[r + 2, c + 1], out[r + 2, c + 2] = A.z.x, A.z.y, A.z.z
+    store_row(A.x, out, r, c)
+    store_row(A.y, out, r + 1, c)
+    store_row(A.z, out, r + 2, c)
+
+
+@inlined
+def store_all(A: Mat6, out: Floats) -> None:
+    """Write a matrix into the first six rows and columns of an array."""
+    store(A.a, out, UPPER_LEFT)
+    store(A.b, out, UPPER_RIGHT)
+    store(A.c, out, LOWER_LEFT)
+    store(A.d, out, LOWER_RIGHT)
 
 
 @inlined

@@ -68,7 +68,7 @@ class SightingError:
         world_T_sonar = values.atPose3(pose_key).compose(self.body_T_sonar)
         view = view_points(world_T_sonar, values.atPoint3(landmark_key)[None])
         if jacobians is not None:
-            jacobians[0] = view.by_sonar[0] @ self.by_body
+            jacobians[0] = view.by_pose[0] @ self.by_body
             jacobians[1] = view.by_point[0]
         e = view.z[0] - self.z
         e[1] = wrap_angle(e[1])

@@ -165,7 +165,7 @@ class PredictedView:
 
         Only the variances grow. The motion also correlates range and azimuth a little, which is left out.
         """
-        H_M = view_points(self.world_T_sonar, points).by_sonar @ self._by_body  # (m, 2, 6)
+        H_M = view_points(self.world_T_sonar, points).by_pose @ self._by_body  # (m, 2, 6)
         variances = (H_M @ motion.covariance * H_M).sum(axis=2)  # diagonals of H_M Q H_M'
         return cov + IDENTITY * variances[:, None]
 
