@@ -133,6 +133,7 @@ def render_report(comparison: Comparison) -> str:
     content = {
         "name": sequence.name,
         "names": [run.estimator for run in runs],
+        "beside_the_paper": sentences.beside_the_paper(comparison),
         "summary": (
             f"{format_value(round(sequence.duration_s, 1))} s of "
             f"{'planar' if sequence.calibration.planar else 'three-dimensional'} motion "

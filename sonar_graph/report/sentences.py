@@ -77,7 +77,6 @@ def finding(comparison: Comparison) -> list[str]:
     if not comparison.sequence.detections:
         sentences.append(no_detections(comparison))
     sentences += lost_runs(comparison)
-    sentences += far_views(comparison)
     metric = headline_metric(comparison)
     if metric is None:
         if len(comparison.failed_runs) == len(runs):
@@ -220,16 +219,34 @@ def lost_runs(comparison: Comparison) -> list[str]:
     return said
 
 
-def far_views(comparison: Comparison) -> list[str]:
-    """A sentence on each filter that did more than the paper's observation (6) and (7) in a log with gaps."""
-    if "log.gaps" not in comparison.sequence.notes:
-        return []
-    return [
-        f"{run.estimator} compared landmarks far from where they were predicted with the point seen (far_views), which "
-        "equations (6) and (7) do not."
-        for run in comparison.runs
-        if flattened(run.params).get("far_views")
-    ]
+def beside_the_paper(comparison: Comparison) -> str | None:
+    """What ekf-slam used in this log beside the paper's equations, one sentence; None without ekf-slam.
+
+    The table of docs/theory/ekf_slam.md has the same rows.
+    """
+    run = next((run for run in comparison.runs if run.estimator == "ekf-slam"), None)
+    if run is None:
+        return None
+    sequence = comparison.sequence
+    calibration = sequence.calibration
+    params = flattened(run.params)
+    has_gaps = "log.gaps" in sequence.notes
+    additions = {
+        "depth": sequence.depth is not None,
+        "gravity for roll and pitch": calibration.use_gravity,
+        "the plane of the calibration": calibration.planar is not None,
+        "the floor's height": calibration.floor is not None,
+        "headings with Huber's kernel and the compass' bias": sequence.heading is not None,
+        "position fixes with Huber's kernel": sequence.positions is not None,
+        "larger noise in gaps of the Doppler log": has_gaps,
+        "far_views": has_gaps and params.get("far_views", False),
+        "gate_probability": params.get("gate_probability", 1.0) < 1.0,
+        "kernel_width": params.get("kernel_width", 0.0) > 0.0,
+    }
+    used = [name for name, is_used in additions.items() if is_used]
+    if not used:
+        return "In this log ekf-slam used nothing beside the paper's equations."
+    return f"Beside the paper's equations ekf-slam used in this log: {', '.join(used)}."
 
 
 def doubt_of_identities(comparison: Comparison) -> list[str]:

@@ -251,15 +251,23 @@ def test_an_estimator_that_refuses_a_fifth_of_the_detections_is_called_lost(gate
     assert detection_scores(few)["detections.nis"].verdict == ("" if told else "over-cautious")
 
 
-def test_a_filter_with_more_than_the_paper_s_observation_is_named_where_the_log_has_gaps():
+def test_what_ekf_slam_used_beside_the_paper_is_named():
     comparison = basin_comparison(60)
     run = replace(comparison.runs[1], params={"far_views": True})
     gaps = replace(comparison.sequence, notes={"log.gaps": "dvl: silent for 60 s"})
-    for sequence, params, count in ((gaps, run.params, 1), (gaps, {}, 0), (comparison.sequence, run.params, 0)):
+    for sequence, params, is_named in (
+        (gaps, run.params, True),
+        (gaps, {}, False),
+        (comparison.sequence, run.params, False),
+    ):
         one = with_run(replace(comparison, sequence=sequence), replace(run, params=params))
-        told = [sentence for sentence in sentences.finding(one) if "(far_views)" in sentence]
-        assert told == sentences.far_views(one)
-        assert len(told) == count
+        sentence = sentences.beside_the_paper(one)
+        assert ("far_views" in sentence) == is_named
+        assert ("in gaps" in sentence) == (sequence is gaps)
+        assert "gravity" in sentence
+        bare = replace(sequence, depth=None, calibration=sequence.calibration.model_copy(update={"use_gravity": False}))
+        assert "gravity" not in sentences.beside_the_paper(replace(one, sequence=bare))
+    assert sentences.beside_the_paper(only(comparison, "isam2")) is None
 
 
 def with_map(
