@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from sonar_graph.calibration import Calibration, Section, require_params
-from sonar_graph.measurements import Floats, Measurements, require_measurements
+from sonar_graph.measurements import Floats, LandmarkDetections, Measurements, require_measurements
 from sonar_graph.models import gravity_direction
 from sonar_graph.motion import MotionSource, PreintegratedMotion, require_source
 from sonar_graph.states import (
@@ -67,11 +67,14 @@ class DeadReckoning:
         require_source(odometry, calibration, "DeadReckoning(calibration, odometry, params)")
         require_params(params, self.Params, "dead-reckoning")
         self._params = params or DeadReckoningParams()
-        self._odometry, self._calibration = odometry, calibration
+        self._odometry = odometry
+        self._calibration = calibration
         has_bias = calibration.imu.gyro_bias_sigma > 0
         self._walk_density = calibration.imu.gyro_bias_walk_density if has_bias else 0.0
         self._pose = calibration.start.pose()
-        R, start = self._pose.rotation().matrix(), calibration.start
+        start = calibration.start
+        R = self._pose.rotation().matrix()
+        # of [theta, rho, bias], theta and rho in body axes
         self._P = np.zeros((9, 9))
         self._P[:3, :3] = np.diag(np.square(start.rpy_sigma_rad))
         self._P[3:6, 3:6] = R.T @ np.diag(np.square(start.position_sigma_m)) @ R
@@ -90,14 +93,10 @@ class DeadReckoning:
         """
         require_measurements(measurements, "dead-reckoning")
         self._odometry.add(measurements.imu, measurements.dvl)
-        self._odometry.used_depths(measurements.depth)  # not used here, but judged and named as by every estimator
-        if (detections := measurements.detections) is not None:
-            ids = detections.most_probable()[0].tolist()
-            outcomes = [
-                Outcome.IGNORED if is_sound else Outcome.UNSOUND for is_sound in detections.are_sound().tolist()
-            ]
-            for stamp_ns, landmark_id, outcome in zip(detections.stamps_ns.tolist(), ids, outcomes, strict=True):
-                self._journal.record(stamp_ns, landmark_id, outcome)
+        # depths are not used here, but judged and listed as by every estimator
+        self._odometry.used_depths(measurements.depth)
+        if measurements.detections is not None:
+            self._record(measurements.detections)
         end_ns = measurements.end_ns
         epoch_ns = self._odometry.start_by(end_ns) if self._epoch_ns is None else self._epoch_ns
         if epoch_ns is None or end_ns < epoch_ns:
@@ -113,11 +112,19 @@ class DeadReckoning:
                 self._felt = self._felt_from = None
         self._odometry.forget_before(epoch_ns)
         self._epoch_ns = epoch_ns
-        pose, P = self._after(self._odometry.motion(epoch_ns, end_ns, ZERO_BIAS, self._attitude()))
-        covariance = P[:6, :6].copy()
-        estimate = Estimate(end_ns, pose, covariance)
+        # the provisional motion to the end of the call leaves the state at the epoch
+        provisional = self._odometry.motion(epoch_ns, end_ns, ZERO_BIAS, self._attitude())
+        pose, P = self._after(provisional)
+        estimate = Estimate(end_ns, pose, P[:6, :6].copy())
         self._estimates.keep(estimate)
         return estimate
+
+    def _record(self, detections: LandmarkDetections) -> None:
+        """Record the outcome of each detection: ignored or unsound."""
+        ids, _ = detections.most_probable()
+        rows = zip(detections.stamps_ns.tolist(), ids.tolist(), detections.are_sound().tolist(), strict=True)
+        for stamp_ns, landmark_id, is_sound in rows:
+            self._journal.record(stamp_ns, landmark_id, Outcome.IGNORED if is_sound else Outcome.UNSOUND)
 
     def trajectory(self) -> Trajectory:
         """The causal estimates; dead reckoning does not revise them."""
@@ -145,13 +152,17 @@ class DeadReckoning:
         found = gravity_direction(felt, begin[0], end[0], sigma_m_s, self._calibration)
         if found is None:
             return
-        (measured, sigma), up = found, self._attitude()[2]
+        measured, sigma = found
+        up = self._attitude()[2]
         H = np.zeros((3, 9))
-        H[:, :3] = np.cross(np.eye(3), up)  # [up]x
-        K = np.linalg.solve(H @ self._P @ H.T + sigma**2 * np.eye(3), H @ self._P).T
+        H[:, :3] = gtsam.SO3.Hat(up)
+        S = H @ self._P @ H.T + sigma**2 * np.eye(3)
+        K = np.linalg.solve(S, H @ self._P).T  # (9, 3)
+        # of the tilt alone: through the bias gravity would reach heading and place, and turn the path
         K[:3] -= np.outer(up, up @ K[:3])
-        K[:3] -= np.outer(up, up @ K[:3])  # through the bias it would reach heading and place, and turn the path
+        K[:3] -= np.outer(up, up @ K[:3])  # again, for the rounding of the first
         K[3:] = 0.0
+        # Joseph's form: K is not the optimal gain
         A = np.eye(9) - K @ H
         self._pose = self._pose.compose(gtsam.Pose3.Expmap((K @ (measured - up))[:6]))
         P = A @ self._P @ A.T + sigma**2 * K @ K.T
@@ -159,7 +170,8 @@ class DeadReckoning:
 
     def _after(self, motion: PreintegratedMotion) -> tuple[gtsam.Pose3, Floats]:
         """Pose, and covariance of [theta, rho, bias], shape (9, 9), after a motion."""
-        F, Q = np.eye(9), np.zeros((9, 9))
+        F = np.eye(9)
+        Q = np.zeros((9, 9))
         F[:6, :6] = motion.i_T_j.inverse().AdjointMap()
         F[:6, 6:] = motion.D_bias
         Q[:6, :6] = motion.covariance

@@ -69,9 +69,18 @@ from sonar_graph.numerics import (
     vec,
 )
 
-Z, ROLL, PITCH, YAW = 2, 3, 4, 5
-POSE, COMPASS, MAP, LANDMARK = 6, 6, 7, 3
-"""Length of x_v, place of c, that of p_1, and length of p_i."""
+Z = 2
+ROLL = 3
+PITCH = 4
+YAW = 5
+COMPASS = 6
+"""Place of c."""
+MAP = 7
+"""Place of p_1."""
+POSE = 6
+"""Length of x_v."""
+LANDMARK = 3
+"""Length of p_i."""
 MOST_PITCH_RAD = 0.5 * math.pi - 1e-3
 """Nearer to 90 degrees Euler angles count as singular."""
 
@@ -210,12 +219,14 @@ def observe(
     sight = sight_of(R, X, sonar.mount, Vec3(x[at], x[at + 1], x[at + 2]))  # (6)
     e = np.array([z[0] - sight.range_m, wrap_angle(z[1] - sight.azimuth_rad)])  # (7)
     H = np.zeros((2, len(x)))
+    # H_b T and H_p, row by row
     store_row6(T.T @ sight.range_by_body, H, 0, 0)
     store_row6(T.T @ sight.azimuth_by_body, H, 1, 0)
     store_row(sight.range_by_point, H, 0, at)
     store_row(sight.azimuth_by_point, H, 1, at)
     noise = R_z + motion_noise(sight.range_by_body, sight.azimuth_by_body, motion)
     S = symmetric(H @ P @ H.T + noise)
+    # the kernel widens the noise of the detection, not that of the motion
     outcome, widened = judged(e, S, R_z, sonar.gate, sonar.kernel_width)
     if outcome != GATED:
         update(x, P, H, e, noise + widened)
@@ -305,7 +316,7 @@ class EkfSlam(FilterShell):
         e = g - x[at : at + LANDMARK]
         H = np.zeros((LANDMARK, len(x)))
         H[:, :POSE] = -G_b @ T
-        H[:, at : at + LANDMARK] = np.eye(3)
+        H[:, at : at + LANDMARK] = np.eye(3)  # e is the point seen less p
         told, R_g = judged_far(e, H @ P @ H.T, G_b @ motion.C @ G_b.T, G_z, sonar, z, R_z)
         if told is not None and told.outcome != GATED:
             update(x, P, H, e, R_g)
@@ -345,6 +356,7 @@ class EkfSlam(FilterShell):
         H[:, :POSE] = H_b @ T
         noise = H_b @ motion.C @ H_b.T
         e = np.array([wrap_angle(yaw_rad - yaw)])
+        # judged without the estimated c: a filter that is wrong takes its error for one of the compass
         off = distance(e, H @ P @ H.T + noise + variance_rad2 + self.compass_variance_rad2)
         H[0, COMPASS] = 1.0
         e = wrap_angle(e - x[COMPASS])
@@ -368,6 +380,7 @@ class EkfSlam(FilterShell):
 
     def update_up(self, up: Floats, sigma_rad: float, i_R_j: Floats) -> None:  # noqa: ARG002  # (4) has no bias
         """Update roll and pitch by the direction of the world's up in the body."""
+        # roll is as uncertain as the pitch is steep
         level = math.hypot(up[1], up[2])
         roll_off = wrap_angle(math.atan2(up[1], up[2]) - self._x[ROLL])
         e = np.array([roll_off, math.atan2(-up[0], level) - self._x[PITCH]])

@@ -22,7 +22,8 @@ from sonar_graph.numerics import LOWER_LEFT, compiled, cross, exp_and_mean, mat,
 
 EPOCH, DEPTH, HEADING, FIX, FRAME, END = range(6)
 """Kinds of events; at equal stamps the lower comes first."""
-NOT_STARTED, LONG_AGO = int(np.iinfo(np.int64).max), int(np.iinfo(np.int64).min)
+NOT_STARTED = int(np.iinfo(np.int64).max)
+LONG_AGO = int(np.iinfo(np.int64).min)
 
 
 class Motion(NamedTuple):
@@ -92,6 +93,7 @@ def read_detections(range_m: Floats, azimuth_rad: Floats, logged: Floats, R_z: F
     for k in range(len(z)):
         z[k, 0] = range_m[k]
         z[k, 1] = azimuth_rad[k]
+        # a covariance off symmetry by rounding is made symmetric
         across = 0.5 * (logged[k, 0, 1] + logged[k, 1, 0])
         is_known = not math.isnan(logged[k, 0, 0] + across + logged[k, 1, 1])
         noise[k, 0, 0] = logged[k, 0, 0] if is_known else R_z[0, 0]
@@ -141,6 +143,7 @@ def in_order(epochs_ns: Ints, reached_ns: Ints, sample_ns: Ints, sample_kind: In
     frame_ns = LONG_AGO
     kind = EPOCH
     while kind != END:
+        # pass over what is late, refused, or of the frame that was just ordered
         while sample < len(sample_ns) and sample_ns[sample] < call.since_ns:
             sample += 1
         while view < len(views.stamp_ns) and (views.stamp_ns[view] == frame_ns or views.outcome[view] != ACCEPTED):
@@ -194,6 +197,7 @@ def remove_rate(motion: Motion, bias: Floats, earth: Floats) -> Motion:
     rate = vec(bias) + 0.5 * (earth_i + dR.T @ earth_i)
     theta = mat(motion.D) @ rate
     rho = mat(motion.D, LOWER_LEFT) @ rate
+    # C and D stay: they would change in second order
     turn, _ = exp_and_mean(theta)
     reduced = Motion(np.empty((3, 3)), np.empty(3), motion.C, motion.D, np.empty(3))
     store(dR @ turn, reduced.dR)

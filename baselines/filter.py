@@ -246,6 +246,7 @@ class FilterShell(ABC):
         depth = self.odometry.used_depths(measurements.depth)
         if self._reached_ns == NOT_STARTED:
             self._start(end_ns)
+        # results depend on stamps alone: what comes later than an estimate for its stamp is late
         since_ns = max(self._done_ns, self._reached_ns)
         self._done_ns = max(self._done_ns, end_ns)
         ids, views = self._views(detections, since_ns)
@@ -388,6 +389,7 @@ class FilterShell(ABC):
         for row in np.flatnonzero(~is_used & (samples.stamp_ns >= self._reached_ns)).tolist():
             kind = int(samples.kind[row])
             stamp_ns = int(samples.stamp_ns[row])
+            # USBL fixes come seconds late as a rule; the motion since is still known
             if is_sound[row] and kind == FIX and stamp_ns >= self.node_ns - KEPT_NS:
                 self._use_late(stamp_ns, samples.value[row], samples.noise[row], since_ns)
             else:
@@ -405,6 +407,7 @@ class FilterShell(ABC):
         is_gap = np.isnan(motions.dp[:, 0]).tolist()
         events = zip(order.kind.tolist(), order.row.tolist(), zip(*motions, strict=True), strict=True)
         for k, (kind, row, columns) in enumerate(events):
+            # a gap depends on the state's attitude and bias, so it is bridged when its turn comes
             motion = self._bridge(order, k, views) if is_gap[k] else self._reduced(Motion(*columns))
             if kind == EPOCH:
                 self._to_epoch(motion, int(order.end_ns[k]), ends_interval=order.ends_interval[k])
@@ -420,6 +423,7 @@ class FilterShell(ABC):
                 self._contradictions.judge("positions", distance)
         R, X, covariance = self.pose_after(motion)
         self.odometry.settle(self.node_ns)
+        # rows that late fixes may still need are kept
         if self.node_ns > self._kept_ns + KEPT_NS:
             self.odometry.forget_before(self.node_ns - KEPT_NS)
             self._kept_ns = self.node_ns
@@ -464,7 +468,7 @@ class FilterShell(ABC):
             z = views.z[row]
             R_z = views.R_z[row]
             slot = int(views.slot[row])
-            if slot == self._landmarks:
+            if slot == self._landmarks:  # the next free number: seen for the first time
                 self.augment(motion, z, R_z)
                 self._landmarks += 1
                 views.outcome[row] = NEW
@@ -561,6 +565,7 @@ def lockout_messages(log: DetectionLog) -> list[str]:
     outliers = int(np.count_nonzero(squared > OUTLYING**2))
     share = OUTLIERS + (1.0 - OUTLIERS) * 0.001
     explained = share * len(e) + 4.0 * math.sqrt(share * (1.0 - share) * len(e))
+    # four sigmas: one run in 30,000 without a fault
     if outliers <= explained:
         return []
     return [

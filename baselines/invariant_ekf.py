@@ -99,10 +99,14 @@ from sonar_graph.numerics import (
     vec,
 )
 
-THETA, BETA, BODY = slice(0, 3), slice(3, 3 + BIASES), slice(3 + BIASES, 6 + BIASES)
-"""Places of theta, beta and xi_0 in xi."""
-BARE, POINT = 6 + BIASES, 3
-"""Length of xi without landmarks, and of one xi_k."""
+THETA = slice(0, 3)
+BETA = slice(3, 3 + BIASES)
+BODY = slice(3 + BIASES, 6 + BIASES)
+"""Place of xi_0 in xi."""
+BARE = 6 + BIASES
+"""Length of xi without landmarks."""
+POINT = 3
+"""Length of one xi_k."""
 BETA_ACCEL = slice(3 + ACCEL.start, 3 + ACCEL.stop)
 BETA_COMPASS = 3 + COMPASS
 NO_UP = np.zeros(3)
@@ -178,6 +182,7 @@ def predict(state: InvariantState, motion: Motion, walk_variance: Floats) -> Non
     store_vector(X, state.points[0], 0)
     P = state.P
     J = np.zeros((len(P), 6))
+    # R and X are those at the end of the motion; the landmarks do not move
     store(R, J)  # theta
     store(R, J[BODY], UPPER_RIGHT)
     for k in range(len(state.points)):
@@ -198,6 +203,7 @@ def predict(state: InvariantState, motion: Motion, walk_variance: Floats) -> Non
 def update(state: InvariantState, H: Floats, e: Floats, R: Floats) -> None:
     """Update by an innovation: ``xi = K e`` moves the estimate by (1), ``P <- P - K S K^T``."""
     xi = correction(state.P, H, e, R)
+    # the error turns with the world, so that all points turn together
     Exp, J_l = exp_and_mean(vec(xi))
     store(Exp @ mat(state.R), state.R)
     for k in range(len(state.points)):
@@ -225,6 +231,7 @@ def observe(
     sight = sight_of(R, X, sonar.mount, vec(state.points[k]))
     e = np.array([z[0] - sight.range_m, wrap_angle(z[1] - sight.azimuth_rad)])
     H = np.zeros((2, len(state.P)))
+    # a turn of everything about the origin changes no view: H_theta is zero
     store_row(sight.range_by_point, H, 0, at)
     store_row(sight.azimuth_by_point, H, 1, at)
     store_row(-1.0 * sight.range_by_point, H, 0, BODY.start)
@@ -245,7 +252,7 @@ def update_depth(state: InvariantState, motion: Motion, port: Floats, z_m: float
     R, X, D = pose_after(state, motion)
     q = vec(port)
     a = X + R @ q
-    h_b = Vec6(cross(q, R.z), R.z)  # by eps
+    h_b = Vec6(cross(q, R.z), R.z)  # of the height by eps
     H = np.zeros((1, len(state.P)))
     store_row(Vec3(a.y, -a.x, 0.0), H, 0, THETA.start)
     H[0, BODY.start + 2] = 1.0

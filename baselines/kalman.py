@@ -36,6 +36,7 @@ def correction(P: Floats, H: Floats, e: Floats, R: Floats) -> Floats:
 
     Raises LinAlgError where S is not positive definite.
     """
+    # with S = L L^T no inverse of S is needed, and a covariance that is not positive definite is noticed
     HP = H @ P  # (m, n)
     S = HP @ H.T + R  # (m, m)
     L_inverse = np.linalg.inv(np.linalg.cholesky(S))
@@ -57,6 +58,7 @@ def symmetric(A: Floats) -> Floats:
 def motion_noise(range_by_body: Vec6, azimuth_by_body: Vec6, motion: Motion) -> Floats:
     """``H_b C H_b^T``, shape (2, 2), of the rows of H_b."""
     C = mat6(motion.C)
+    # C is the covariance in body axes, as H_b takes them
     across = range_by_body @ (C @ azimuth_by_body)
     return np.array(
         [
@@ -79,7 +81,7 @@ def judged(e: Floats, S: Floats, R_z: Floats, gate: float, kernel_width: float) 
     `GATED` where the `distance` exceeds the gate. The kernel has the weight ``w_i = 1 / (1 + e_i^2 / (S_ii k^2))`` and
     makes ``R_ij / sqrt(w_i w_j)`` of the noise; an infinite width k adds nothing.
     """
-    if not distance(e, S) <= gate:
+    if not distance(e, S) <= gate:  # NaN is refused too
         return GATED, np.zeros((2, 2))
     spread = np.empty(2)  # 1 / sqrt(w)
     for i in range(2):
