@@ -28,7 +28,6 @@ import numpy as np
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Floats
 from sonar_graph.motion import PreintegratedMotion
-from sonar_graph.numerics import compiled
 
 LEAST_GYRO_NOISE_DENSITY = 1e-7
 """rad/s/√Hz, ten times below the best fibre gyros: keeps tau finite for a gyro without noise."""
@@ -56,7 +55,6 @@ def gravity_direction(
     return up_j, tilt_sigma(motion.duration_s, sigma_m_s, calibration, has_bias=has_bias)
 
 
-@compiled
 def up_direction(force: Floats, i_R_j: Floats, velocity_i: Floats, velocity_j: Floats, duration_s: float) -> Floats:
     """up_j of the mean specific force in frame i, shape (3,); NaN where the force is not measured."""
     g_i = force - (i_R_j @ velocity_j - velocity_i) / duration_s

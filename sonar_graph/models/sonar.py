@@ -31,6 +31,7 @@ from sonar_graph.numerics import (
     Mat3,
     Vec3,
     Vec6,
+    compilable,
     compiled,
     cross,
     cross_matrix,
@@ -53,7 +54,7 @@ its variance from elevation, pose and floor."""
 Angle = TypeVar("Angle", float, Floats)
 
 
-@compiled
+@compilable
 def wrap_angle(angle_rad: Angle) -> Angle:
     """The same direction in (-pi, pi], of one angle or of an array."""
     turns: Any = np.ceil((angle_rad - math.pi) / (2.0 * math.pi))

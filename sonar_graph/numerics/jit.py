@@ -9,7 +9,7 @@ from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any, TypeVar, cast
 
-import numba
+import numba.extending
 from numba.core.dispatcher import Dispatcher
 
 Compiled = TypeVar("Compiled")
@@ -47,6 +47,11 @@ def inlined(function: Compiled) -> Compiled:
     There, tuples stay in registers only within one function. Elsewhere it just costs compile time in every caller.
     """
     return compiled(function, forceinline=True)
+
+
+def compilable(function: Compiled) -> Compiled:
+    """Leave a function to Python, where arrays of any kind need no compilation; compiled functions can call it too."""
+    return cast(Compiled, cast(Any, numba.extending).register_jitable(function))
 
 
 def _digest(module: dict[str, Any]) -> str:
