@@ -14,7 +14,7 @@ from sonar_graph.numerics.rotations import cross_matrix, running_rotations
 __all__ = [
     "I3", "LOWER_LEFT", "LOWER_RIGHT", "Mat3", "Mat6", "O3", "UPPER_RIGHT", "Vec3", "Vec6", "ZERO",
     "chi_square_exceeded", "chi_square_quantile", "chi_square_share", "chord_inverse", "compilable", "compiled",
-    "compiling_s",     "cross", "cross_matrix", "curvature", "diagonal", "exp_and_mean", "gate_threshold", "inlined",
+    "compiling_s", "cross", "cross_matrix", "curvature", "diagonal", "exp_and_mean", "gate_threshold", "inlined",
     "mat", "mat6", "outer", "quaternion", "rodrigues", "rotation_log", "running_rotations", "skew",
     "store", "store6", "store_all", "store_row", "store_row6", "store_vector", "vec",
 ]
