@@ -94,6 +94,15 @@ def test_offset_yaw_and_scale_are_found():
     assert_found(found.scale, SCALE, 0.02)
 
 
+def test_rows_at_two_and_a_half_a_second_are_averaged_alike_at_every_offset():
+    """As the moved stamps are rounded, 2.5 rows a second would be means over two rows or over three."""
+    run = spoilt()
+    stamps_ns = np.arange(run.dvl.stamps_ns[0], run.dvl.stamps_ns[-1], 400_000_000)
+    velocity = np.column_stack([np.interp(stamps_ns, run.dvl.stamps_ns, v) for v in run.dvl.velocity.T])
+    slow = replace(run, dvl=dvl(stamps_ns, velocity))
+    assert_found(matched(slow).offset, OFFSET_S, 0.6)
+
+
 def test_straight_and_steady_driving_tells_nothing():
     rng, n = np.random.default_rng(0), 12_000
     rate, force = 1e-4 * rng.standard_normal((n, 3)), [0, 0, 9.81] + 1e-2 * rng.standard_normal((n, 3))

@@ -299,7 +299,9 @@ def velocity_changes(
         drifting = P_since - cross_matrices(F_since) @ S[r][0] - cross_matrices(carried) @ S_since
         # by scale, mounting, lever arm, both biases: (n, 3, 13)
         columns = [-carried[:, :, None], C[r] @ cross_matrices(in_body), turning[r], -S_since, drifting]
-        together = max(1, round(MEAN_OVER_S / float(np.median(np.diff(since)))))
+        # by the stamps as they are: moved stamps are rounded, and 2.5 rows a second would become 2 or 3
+        interval_s = float(np.median(np.diff(stamped_s[r])))
+        together = max(1, round(MEAN_OVER_S / interval_s))
         t = means_over(since, together)
         upright, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], F_since[-1:])
         level_R_g = np.asarray(upright.as_matrix())
