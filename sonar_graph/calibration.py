@@ -131,7 +131,7 @@ class DvlCalibration(Section):
     gap_s: Positive = 1.5
     """Time without a sample above which there is a DVL gap, bridged by accelerometers."""
     velocity_walk_density: Positive = 0.1
-    """Random walk of the vehicle's velocity, m/s/√s: for DVL gaps without accelerometers and the gate of outliers."""
+    """Random walk of the vehicle's velocity, m/s/√s: for gaps of the log and the gate of outliers."""
     scale_error: Annotated[Number, within(-0.2, 0.2, "a relative error between -0.2 and 0.2 (0.5 % are 0.005)")] = 0.0
     """Known relative error of its velocities, 0.01 where they are 1 % too fast: taken from the rows."""
     scale_sigma: Annotated[Number, within(0, 0.2, "a relative error between 0 and 0.2 (0.5 % are 0.005)")] = 0.0

@@ -18,9 +18,17 @@ accelerometers at t change s by ``[x]x theta + a R n``. White noise and constant
     cov(s) = n_g^2 sum dt [x]x [x]x^T + n_a^2 sum dt a^2 I,    cov(s, theta) = n_g^2 sum dt [x]x     (2)
     D_gyro = -sum dt [x]x R,    D_accel = -sum dt a R                                                (3)
 
-Walk: where a specific force was not measured, or too little precedes the epoch, the velocity is a random walk of root
-density q (m/s/√s) between its ends, ``q^2 T^3 / 12`` (closed), or from its last value on, ``q^2 T^3 / 3`` (open). An
-open gap is a walk too once the accelerometers are less sure than that (`longest_open_s`).
+Prior: the velocity in the body stays what the Doppler log measured, and walks with root density q (m/s/√s) between both
+ends (closed) or from its last value on (open). Its displacement s_0 errs by ``W = q^2 T^3 / 12 I`` or
+``q^2 T^3 / 3 I``, besides the noise C_0 of gyros and Doppler log. The line, with its C and D, corrects the prior as a
+measurement does in a Kalman filter. In the last frame, with b the sigma of the gyro bias, and c for what a linear D
+leaves out::
+
+    V = C - C_0 + b^2 (D - D_0) (D - D_0)^T + c I,    c = 2 (b T)^2 |b (D - D_0)|^2
+    K = W (W + V)^-1,    s_0 + K (s - s_0),    D_0 + K (D - D_0)                                     (4)
+    C_0 + K (C - C_0 + c I) K^T + (I - K) W (I - K)^T                                                (5)
+
+Where a specific force was not measured, or too little precedes the epoch, there is no line and K = 0.
 
 docs/theory/gaps.md has the derivation and the same equation numbers.
 """
@@ -56,19 +64,6 @@ SHORTEST_S = 1.0
 """Shortest time that they span."""
 
 
-def longest_open_s(sensors: Sensors) -> float:
-    """Time T after which an open gap's horizontal error by accelerometers exceeds that of the walk.
-
-    ``n_a^2 T^3 / 3 + g^2 n_g^2 T^5 / 20 + b^2 T^4 / 4 = q^2 T^3 / 3``, of a vehicle that has turned since the slope of
-    the line was measured, so that the accelerometer bias b counts in full; infinite for sensors without errors.
-    """
-    tilting = (sensors.gravity_m_s2 * sensors.gyro_density) ** 2 / 20.0
-    turned = sensors.accel_bias_sigma**2 / 4.0
-    more = max(sensors.velocity_walk_density**2 - sensors.accel_density**2, 0.0) / 3.0
-    root = turned + math.sqrt(turned**2 + 4.0 * tilting * more)
-    return 2.0 * more / root if root > 0.0 else math.inf
-
-
 def closed_bridge(rows: Rows, sensors: Sensors, removed: Removed, start_ns: int, end_ns: int) -> PreintegratedMotion:
     """Motion over a gap from an epoch to the next one."""
     k = int(rows.dvl_ns.searchsorted(start_ns))
@@ -81,44 +76,38 @@ def closed_bridge(rows: Rows, sensors: Sensors, removed: Removed, start_ns: int,
     after_s = before_s if before_s * 1e9 <= sensors.longest_ns else 0.0
     squares_s2 = 0.25 * T * (T + 2.0 * np.array([before_s, after_s]))
     ends = LineFit(np.array([k, k + 1]), np.full(2, 0.5 * T), squares_s2)
-    motion = _by_accelerometers(rows, sensors, removed, ends, end_ns)
-    if motion is not None:
-        return motion
-    doppler_psd = np.tensordot(squares_s2 / T, rows.cov[k : k + 2], 1)
-    return _walk(rows, sensors, removed, start_ns, end_ns, doppler_psd)
+    line = _by_accelerometers(rows, sensors, removed, ends, end_ns)
+    # noise of such a density between the two rows has the variance of the line's samples
+    doppler_cov = np.tensordot(squares_s2 / T**2, rows.cov[k : k + 2], 1)
+    prior = _prior(rows, (k, k + 1), np.array([start_ns, end_ns]), doppler_cov)
+    steady = motion_over(prior, sensors, removed, start_ns, end_ns)
+    walked_m2 = sensors.velocity_walk_density**2 * T**3 / 12.0
+    return _corrected(steady, walked_m2, line, sensors.gyro_bias_sigma)
 
 
-def open_bridge(
-    rows: Rows, sensors: Sensors, removed: Removed, start_ns: int, end_ns: int, whole_end_ns: int
-) -> PreintegratedMotion:
-    """Motion from an epoch to an instant in the gap after it, by rows that are known at that instant.
-
-    ``whole_end_ns``: end of the whole motion that this is a part of; its length decides whether the velocity walks.
-    """
+def open_bridge(rows: Rows, sensors: Sensors, removed: Removed, start_ns: int, end_ns: int) -> PreintegratedMotion:
+    """Motion from an epoch to an instant in the gap after it, by rows that are known at that instant."""
     k = int(rows.dvl_ns.searchsorted(start_ns))
     rows = rows.known(max(end_ns, int(rows.known_ns[k])))  # the epoch may be known later than the instant
     dvl_ns = rows.dvl_ns
-    T = (end_ns - start_ns) * 1e-9
     if (dvl_ns[k + 1 : k + 2] - start_ns <= sensors.longest_ns).any():
         # Velocities go on, inertial rows are missing: by velocities as far as they go.
         last_ns = min(int(dvl_ns[-1]), end_ns)
         sampled = motion_over(rows, sensors, removed, start_ns, last_ns)
         if last_ns == end_ns:
             return sampled
-        return sampled.then(_walk(rows, sensors, removed.after(sampled), last_ns, end_ns))
-    if (whole_end_ns - start_ns) * 1e-9 > longest_open_s(sensors):
-        return _walk(rows, sensors, removed, start_ns, end_ns)
+        return sampled.then(_open(rows, sensors, removed.after(sampled), last_ns, end_ns))
+    line = None
     first = int(dvl_ns.searchsorted(max(start_ns - WINDOW_NS, rows.imu_ns[0])))
     samples = np.arange(first, k + 1)
     t = (dvl_ns[samples] - start_ns) * 1e-9
     if len(t) >= FEWEST and -t[0] >= SHORTEST_S:
+        T = (end_ns - start_ns) * 1e-9
         off = t - t.mean()
         slope = (0.5 * T - t.mean()) * off / (off @ off)
         weights_s = T * (1.0 / len(t) + slope)
-        motion = _by_accelerometers(rows, sensors, removed, LineFit(samples, weights_s, weights_s**2), end_ns)
-        if motion is not None:
-            return motion
-    return _walk(rows, sensors, removed, start_ns, end_ns)
+        line = _by_accelerometers(rows, sensors, removed, LineFit(samples, weights_s, weights_s**2), end_ns)
+    return _open(rows, sensors, removed, start_ns, end_ns, line)
 
 
 class LineFit(NamedTuple):
@@ -296,27 +285,57 @@ def sum_along(rows: Rows, imu_rows: int, line: Line, removed: Removed) -> LineSu
     return LineSums(R_cuts, v, s, y, yy, yR, R_after, aa, aR)
 
 
-def _walk(
-    rows: Rows, sensors: Sensors, removed: Removed, start_ns: int, end_ns: int, doppler_psd: Floats | None = None
+def _open(
+    rows: Rows,
+    sensors: Sensors,
+    removed: Removed,
+    start_ns: int,
+    end_ns: int,
+    line: PreintegratedMotion | None = None,
 ) -> PreintegratedMotion:
-    """Motion with a velocity that walks between both ends, or (without a density of their noise) after the last sample.
-
-    It is that of a Doppler log of two rows whose noise between them, or after them, has the density wanted.
-    """
+    """Motion after the last sample, by the velocity that it measured and the line."""
     k = int(rows.dvl_ns.searchsorted(start_ns))
     T = (end_ns - start_ns) * 1e-9
-    # a walk is white noise of the velocity, integrated: variance q^2 T^3 / 12 or / 3 of the displacement
-    walked = (sensors.velocity_walk_density * T) ** 2 * np.eye(3)
-    if doppler_psd is None:
-        dvl_ns = np.array([start_ns - NS_PER_S, start_ns])
-        velocity = rows.velocity[[k, k]]
-        cov = T * rows.cov[k] + walked / 3.0
+    # noise of this density, a second apart, has the variance of T times the last velocity
+    prior = _prior(rows, (k, k), np.array([start_ns - NS_PER_S, start_ns]), T * rows.cov[k])
+    steady = motion_over(prior, sensors, removed, start_ns, end_ns)
+    walked_m2 = sensors.velocity_walk_density**2 * T**3 / 3.0
+    return _corrected(steady, walked_m2, line, sensors.gyro_bias_sigma)
+
+
+def _prior(rows: Rows, ends: tuple[int, int], dvl_ns: Ints, cov: Floats) -> Rows:
+    """Rows with a Doppler log of two samples, which measure the velocities of two rows with one covariance."""
+    velocity = rows.velocity[list(ends)]
+    return rows._replace(dvl_ns=dvl_ns, velocity=velocity, cov=np.array([cov, cov]), known_ns=dvl_ns)
+
+
+def _corrected(
+    steady: PreintegratedMotion, walked_m2: float, line: PreintegratedMotion | None, gyro_bias_sigma: float
+) -> PreintegratedMotion:
+    """Steady motion whose velocity walks, corrected by the line: (4) and (5)."""
+    W = walked_m2 * np.eye(3)
+    K = np.zeros((3, 3))
+    bent_m2 = 0.0  # c
+    if line is None:
+        line = steady
     else:
-        dvl_ns = np.array([start_ns, end_ns])
-        velocity = rows.velocity[k : k + 2]
-        cov = (doppler_psd + walked / 12.0) / T
-    log = rows._replace(dvl_ns=dvl_ns, velocity=velocity, cov=np.array([cov, cov]), known_ns=dvl_ns)
-    return motion_over(log, sensors, removed, start_ns, end_ns)
+        by_bias = gyro_bias_sigma * (line.D_bias - steady.D_bias)[3:]  # b (D - D_0), (3, 3)
+        bent_m2 = 2.0 * float(gyro_bias_sigma * line.duration_s * np.linalg.norm(by_bias, 2)) ** 2
+        # a line fitted to many samples may have less Doppler noise than the last sample
+        variances, axes = np.linalg.eigh((line.covariance - steady.covariance)[3:, 3:])
+        V = (axes * np.maximum(variances, 0.0)) @ axes.T + by_bias @ by_bias.T + bent_m2 * np.eye(3)
+        K = walked_m2 * np.linalg.inv(W + V)
+    i_R_j = steady.i_T_j.rotation()
+    steady_p = steady.i_T_j.translation()
+    off = i_R_j.unrotate(line.i_T_j.translation() - steady_p)  # s - s_0 in the last frame
+    i_T_j = gtsam.Pose3(i_R_j, steady_p + i_R_j.rotate(K @ off))
+    G = np.eye(6)  # both have the same turn
+    G[3:, 3:] = K
+    rest = np.eye(3) - K
+    covariance = steady.covariance + G @ (line.covariance - steady.covariance) @ G.T
+    covariance[3:, 3:] += rest @ W @ rest.T + bent_m2 * K @ K.T
+    D_bias = steady.D_bias + G @ (line.D_bias - steady.D_bias)
+    return replace(line, i_T_j=i_T_j, covariance=0.5 * (covariance + covariance.T), D_bias=D_bias)
 
 
 def remaining_motion(before: PreintegratedMotion, whole: PreintegratedMotion) -> PreintegratedMotion:

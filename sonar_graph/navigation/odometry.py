@@ -209,10 +209,10 @@ class Odometry:
         lost_ns = self._newest_epoch(min(end_ns, known_ns))
         if lost_ns is not None and lost_ns < start_ns < end_ns and self.is_gap(lost_ns, end_ns):
             # both instants lie in one open gap
-            before = self._motion_since(lost_ns, start_ns, known_ns, removed, end_ns)
-            whole = self._motion_since(lost_ns, end_ns, known_ns, removed, end_ns)
+            before = self._motion_since(lost_ns, start_ns, known_ns, removed)
+            whole = self._motion_since(lost_ns, end_ns, known_ns, removed)
             return remaining_motion(before, whole)
-        return self._motion_since(start_ns, end_ns, known_ns, removed, end_ns)
+        return self._motion_since(start_ns, end_ns, known_ns, removed)
 
     def motions(self, start_ns: Ints, end_ns: Ints, known_ns: Ints, bias: Floats) -> Motions:
         """Motions over intervals, each from rows known at its ``known_ns``."""
@@ -277,13 +277,10 @@ class Odometry:
         if start_ns < first_ns:
             raise MeasurementError(f"start_ns: {start_ns} lies before the rows; begin at {first_ns} or later")
 
-    def _motion_since(
-        self, start_ns: int, end_ns: int, known_ns: int, removed: Removed, whole_end_ns: int
-    ) -> PreintegratedMotion:
+    def _motion_since(self, start_ns: int, end_ns: int, known_ns: int, removed: Removed) -> PreintegratedMotion:
         """Motion from an instant: final to the newest epoch, provisional from there on.
 
-        Gaps between epochs are bridged; between gaps the motion is one sum of steps. ``whole_end_ns``: as for
-        `open_bridge`.
+        Gaps between epochs are bridged; between gaps the motion is one sum of steps.
         """
         rows = self.rows()
         sensors = self._sensors
@@ -311,7 +308,7 @@ class Odometry:
         if len(epochs_ns) and self.is_gap(newest_ns, end_ns):
             before = stretch.motion
             here = removed.after(before)
-            since_lost = open_bridge(rows.known(known_ns), sensors, here, newest_ns, end_ns, whole_end_ns)
+            since_lost = open_bridge(rows.known(known_ns), sensors, here, newest_ns, end_ns)
             return before.then(since_lost)
         return stretch.continued(rows, sensors, removed, end_ns, known_ns).motion
 

@@ -98,6 +98,8 @@ class Sensors(NamedTuple):
     """Longest interval between Doppler samples that is no gap."""
     gyro_density: float
     """rad/s/√Hz."""
+    gyro_bias_sigma: float
+    """rad/s."""
     accel_density: float
     """m/s²/√Hz."""
     accel_bias_sigma: float
@@ -118,6 +120,7 @@ class Sensors(NamedTuple):
         return cls(
             longest_ns=longest_interval_ns(calibration),
             gyro_density=imu.gyro_noise_density,
+            gyro_bias_sigma=imu.gyro_bias_sigma,
             accel_density=imu.accel_noise_density,
             accel_bias_sigma=imu.accel_bias_sigma,
             velocity_walk_density=dvl.velocity_walk_density,

@@ -6,13 +6,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from sonar_graph.calibration import Calibration, ImuCalibration, Start
+from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Start
 from sonar_graph.estimator import load_estimator
 from sonar_graph.measurements import Dvl, Imu, Measurements
 from sonar_graph.navigation import Odometry
-from sonar_graph.navigation.dvl_gaps import longest_open_s
 from sonar_graph.navigation.imu_gaps import Turns, closed_variance, error_in_hole, hole_ns, open_variance
-from sonar_graph.navigation.preintegration import Sensors
 from sonar_graph.testing import check_consistent
 
 from . import ways
@@ -55,7 +53,8 @@ def test_both_ends_of_a_gap_count_by_their_own_noise(is_blind):
     imu, dvl = ways.rows()
     sigma = np.where(dvl.stamps_ns <= at(ways.LOST_S), 0.01, 0.03)
     noisy = Dvl(dvl.stamps_ns, dvl.velocity, sigma[:, None, None] ** 2 * np.eye(3))
-    found = motion(ways.blinded(imu) if is_blind else imu, noisy, ways.calibration(), ways.LOST_S, ways.FOUND_S)
+    known = ways.calibration(velocity_walk_density=ways.STEADY if is_blind else ways.ANY_VELOCITY)
+    found = motion(ways.blinded(imu) if is_blind else imu, noisy, known, ways.LOST_S, ways.FOUND_S)
     assert np.diag(found.covariance)[3:] == pytest.approx(
         [(0.01**2 + 0.03**2) * 5.0 * (5.0 + 2 * 0.5) / 4] * 3, rel=1e-3
     )
@@ -70,33 +69,118 @@ def test_too_few_samples_for_a_line_leave_a_walk():
     assert not motion(imu, dvl, known, ways.LOST_S, ways.OPEN_S).i_T_j.equals(walked.i_T_j, 0.1)
 
 
-def walk(known, imu_rows, dvl_rows, start_s, until_s):
-    """Motion within a gap without accelerometers."""
+CHEAP = ImuCalibration(
+    gyro_noise_density=3e-4,
+    gyro_bias_sigma=1e-3,
+    accel_noise_density=1e-2,
+    accel_bias_sigma=0.02,
+    mounting=QUIET.mounting,
+)
+"""Accelerometers are surer than a walk at first and less sure after some seconds."""
+
+
+def total(found, sigma=CHEAP.gyro_bias_sigma):
+    """Covariance of the translation with the part of the gyro bias."""
+    by_bias = sigma * found.D_bias[3:]
+    return found.covariance[3:, 3:] + by_bias @ by_bias.T
+
+
+def ways_over(known, end_s):
+    """Motion over the gap: as it is, by the accelerometers alone, and by a velocity that walks."""
+    imu_rows, dvl_rows = Vehicle().rows()
+    alone = known.model_copy(update={"dvl": known.dvl.model_copy(update={"velocity_walk_density": ways.ANY_VELOCITY})})
+    return [
+        motion(rows, dvl_rows, calibration, Vehicle.LOST_S, end_s)
+        for rows, calibration in ((imu_rows, known), (imu_rows, alone), (ways.blinded(imu_rows), known))
+    ]
+
+
+def test_an_open_gap_has_no_leap_however_long_it_lasts():
+    """Mean and sigma change steadily from one inertial row to the next, and the sigma only grows."""
+    ends_s = np.arange(Vehicle.LOST_S + 2.0, Vehicle.FOUND_S - 0.5, 0.02)
+    found = [ways_over(Calibration(imu=CHEAP, dvl=DVL), end_s)[0] for end_s in ends_s]
+    steps = np.diff([one.i_T_j.translation() for one in found], axis=0)
+    sigmas = np.sqrt([np.linalg.eigvalsh(total(one)) for one in found])
+    assert np.abs(np.diff(steps, axis=0)).max() < 2e-3
+    assert min(np.linalg.eigvalsh(one.covariance)[0] for one in found) > 0.0
+    assert (np.diff(sigmas, axis=0) > 0.0).all()
+    assert np.diff(sigmas, axis=0).max() < 0.01
+
+
+@pytest.mark.parametrize("end_s", [9.0, 12.0, 15.0, Vehicle.FOUND_S])
+def test_a_gap_is_surer_than_by_accelerometers_alone_or_by_a_walk_alone(end_s):
+    found, by_accelerometers, walked = (total(one) for one in ways_over(Calibration(imu=CHEAP, dvl=DVL), end_s))
+    for other in (by_accelerometers, walked):
+        assert np.linalg.eigvalsh(other - found).min() > -0.02 * np.linalg.eigvalsh(other).min()
+
+
+@pytest.mark.parametrize("end_s", [14.0, Vehicle.FOUND_S])
+def test_perfect_accelerometers_leave_no_walk_and_useless_ones_nothing_else(end_s):
+    found, by_accelerometers, _ = ways_over(Calibration(imu=QUIET, dvl=DVL), end_s)
+    assert found.i_T_j.equals(by_accelerometers.i_T_j, 1e-3)
+    useless = CHEAP.model_copy(update={"accel_noise_density": 1e4})
+    found, _, walked = ways_over(Calibration(imu=useless, dvl=DVL), end_s)
+    assert found.i_T_j.equals(walked.i_T_j, 1e-3)
+    assert found.covariance == pytest.approx(walked.covariance, rel=1e-3, abs=1e-6)
+
+
+@pytest.mark.parametrize("end_s", [14.0, Vehicle.FOUND_S])
+def test_the_derivative_by_the_bias_is_that_of_both_parts(end_s):
+    """But for the gain, which changes with the bias by a few percent."""
+    (imu_rows, dvl_rows), step = Vehicle().rows(), 1e-6
+    how = Calibration(imu=CHEAP, dvl=DVL), Vehicle.LOST_S, end_s
+    base = motion(imu_rows, dvl_rows, *how)
+    moved = [motion(imu_rows, dvl_rows, *how, bias=step * axis) for axis in np.eye(3)]
+    columns = [ways.change_of(base, one) / step for one in moved]
+    assert base.D_bias == pytest.approx(np.transpose(columns), abs=0.03 * np.abs(base.D_bias).max())
+
+
+def test_motions_in_one_gap_add_up_to_the_whole():
+    (imu_rows, dvl_rows), known = Vehicle().rows(), Calibration(imu=CHEAP, dvl=DVL)
     odometry = Odometry(known)
-    odometry.add(ways.blinded(imu_rows), dvl_rows.between(0, at(Vehicle.LOST_S)))
-    return odometry.motion(at(start_s), at(until_s), np.zeros(3)).i_T_j
+    odometry.add(imu_rows, dvl_rows.between(0, at(Vehicle.LOST_S)))
+    cuts_s = [Vehicle.LOST_S, 8.0, 11.0, 15.0]
+    parts = [odometry.motion(at(a), at(b), np.zeros(3)) for a, b in pairwise(cuts_s)]
+    whole = odometry.motion(at(cuts_s[0]), at(cuts_s[-1]), np.zeros(3))
+    added = parts[0].then(parts[1]).then(parts[2])
+    assert added.i_T_j.equals(whole.i_T_j, 1e-9)
+    assert added.covariance == pytest.approx(whole.covariance, rel=1e-6, abs=1e-9)
+    assert added.D_bias == pytest.approx(whole.D_bias, abs=1e-9 * np.abs(whole.D_bias).max())
 
 
-def test_a_gap_that_stays_open_is_a_walk_once_accelerometers_are_less_sure_than_that():
-    """Both variances of the limit's equation are equal there; the end of the gap brings the accelerometers back."""
-    cheap = ImuCalibration(gyro_noise_density=3e-3, accel_noise_density=1e-2, accel_bias_sigma=0.05)
-    known = Calibration(imu=cheap, dvl=DVL)
-    T, g, q = longest_open_s(Sensors.of(known)), known.gravity_m_s2, DVL.velocity_walk_density
-    assert 1e-4 * T**3 / 3 + (g * 3e-3) ** 2 * T**5 / 20 + 0.05**2 * T**4 / 4 == pytest.approx(q**2 * T**3 / 3)
-    assert 2.0 < T < Vehicle.FOUND_S - Vehicle.LOST_S - 1.0
-    (imu_rows, dvl_rows), lost_s = Vehicle().rows(), Vehicle.LOST_S
-    for until_s, is_walk in ((lost_s + T - 0.1, False), (lost_s + T + 0.1, True), (Vehicle.FOUND_S, False)):
-        found, walked = (motion(rows, dvl_rows, known, lost_s, until_s) for rows in (imu_rows, ways.blinded(imu_rows)))
-        assert found.i_T_j.equals(walked.i_T_j, 0.0) == is_walk
-        assert np.array_equal(found.covariance, walked.covariance) == is_walk
-    odometry, early = Odometry(known), lost_s + T - 1.0
-    odometry.add(imu_rows, dvl_rows.between(0, at(lost_s)))
-    first, rest = (odometry.motion(at(lost_s), at(until_s), np.zeros(3)) for until_s in (early, lost_s + T + 0.1))
-    after = odometry.motion(at(early), at(lost_s + T + 0.1), np.zeros(3))  # both parts of one walk
-    assert after.i_T_j.equals(walk(known, imu_rows, dvl_rows, early, lost_s + T + 0.1), 1e-9)
-    assert not first.i_T_j.compose(after.i_T_j).equals(rest.i_T_j, 1e-3)
-    exact = ImuCalibration(gyro_noise_density=0.0, accel_noise_density=0.0, accel_bias_sigma=0.0)
-    assert longest_open_s(Sensors.of(Calibration(imu=exact))) == np.inf
+@pytest.mark.parametrize("is_closed", [False, True])
+@pytest.mark.parametrize("gap_s", [8.0, 20.0])
+def test_the_errors_of_walking_vehicles_are_as_large_as_their_covariance(gap_s, is_closed):
+    """Level vehicles whose velocity walks as the calibration has it, gyros and accelerometers with a bias each."""
+    rng, rate_hz, q = np.random.default_rng(5), 20.0, 0.05
+    before_s = 8.0
+    imu_ns = stamps(rate_hz, before_s + gap_s + 2.0)
+    every = round(rate_hz / 5.0)
+    dvl_ns = imu_ns[::every]
+    t = (dvl_ns - T0_NS) * 1e-9
+    has_lock = (t <= before_s) | (t > before_s + gap_s - 0.3) if is_closed else t <= before_s
+    sensors = CHEAP.model_copy(update={"mounting": ImuCalibration().mounting})
+    known = Calibration(imu=sensors, dvl=DvlCalibration(velocity_walk_density=q, velocity_sigma_m_s=(0.005,) * 3))
+    n = len(imu_ns)
+    squares = []
+    for _ in range(150):
+        force = q * np.sqrt(rate_hz) * rng.standard_normal((n, 3))  # piecewise linear between rows, as interpolated
+        middle = 0.5 * (force[1:] + force[:-1]) / rate_hz
+        velocity = np.array([0.5, 0.0, 0.0]) + np.vstack([np.zeros(3), np.cumsum(middle, axis=0)])
+        noise = np.sqrt(rate_hz) * rng.standard_normal((2, n, 3))
+        biases = rng.standard_normal((2, 3))
+        rate = sensors.gyro_noise_density * noise[0] + sensors.gyro_bias_sigma * biases[0]
+        force = force + [0.0, 0.0, 9.80665] + sensors.accel_noise_density * noise[1]
+        force += sensors.accel_bias_sigma * biases[1]
+        log = dvl(dvl_ns, velocity[::every] + 0.005 * rng.standard_normal((len(dvl_ns), 3)))
+        end_s = t[has_lock & (t > before_s)][0] if is_closed else before_s + gap_s
+        found = motion(Imu(imu_ns, rate, force), log.rows(has_lock), known, before_s, end_s)
+        first = round(before_s * rate_hz)
+        last = round(end_s * rate_hz)
+        way = np.sum(0.5 * (velocity[first + 1 : last + 1] + velocity[first:last]), axis=0) / rate_hz
+        error = found.i_T_j.rotation().unrotate(found.i_T_j.translation() - way)
+        squares.append(error @ np.linalg.solve(total(found), error))
+    check_consistent(np.array(squares), 3, confidence=0.999)
 
 
 @pytest.mark.parametrize("until_s", [16.0, 15.9, 14.0])
@@ -239,7 +323,7 @@ def test_a_line_needs_four_samples_over_a_second_that_inertial_rows_cover(dvl_hz
 def test_the_displacement_is_that_of_the_fitted_line():
     """Samples of the last five seconds, off gravity's line, are fitted by least squares, as numpy does."""
     noise = 0.01 * np.random.default_rng(0).standard_normal((41, 3))
-    found = at_rest_until(17.0, 4.0, noise=noise, velocity_walk_density=1.0)
+    found = at_rest_until(17.0, 4.0, noise=noise)
     t = -np.arange(20, -1, -1) / 4.0
     slope, level = np.polyfit(t, noise[-21:], 1)
     assert found.i_T_j.translation() == pytest.approx(7.0 * level + 7.0**2 / 2 * slope, abs=1e-6)

@@ -18,6 +18,8 @@ IMU_HZ, DVL_HZ = 10.0, 2.0
 LOST_S, FOUND_S, OPEN_S, WAITS_S = 6.0, 11.0, 10.8, 1e-3
 BODY_P_IMU, BODY_P_DVL = np.array([0.2, -0.1, 0.1]), np.array([-0.5, 0.3, -0.2])
 SIGMA_M_S = (0.01, 0.02, 0.005)
+ANY_VELOCITY, STEADY = 1e3, 1e-9
+"""Walks of the velocity, m/s/√s: gaps are bridged by the accelerometers alone, or by a steady velocity."""
 NO_NOISE = {"gyro_noise_density": 0.0, "accel_noise_density": 0.0, "accel_bias_sigma": 0.0}
 
 
@@ -75,7 +77,7 @@ def rows(lever=BODY_P_DVL - BODY_P_IMU, dvl_hz=DVL_HZ, pings_s=None):
 
 def calibration(imu=None, body_p_imu=BODY_P_IMU, interpolation="linear", **dvl):
     sensors = ImuCalibration(**{**NO_NOISE, **(imu or {})}, mounting=Mounting(translation_m=tuple(body_p_imu)))
-    doppler = {"velocity_sigma_m_s": (0.0,) * 3, "velocity_walk_density": 1e-9, **dvl}
+    doppler = {"velocity_sigma_m_s": (0.0,) * 3, "velocity_walk_density": ANY_VELOCITY, **dvl}
     return Calibration(
         imu=sensors,
         dvl=DvlCalibration(**doppler, mounting=Mounting(translation_m=tuple(BODY_P_DVL))),
@@ -84,7 +86,8 @@ def calibration(imu=None, body_p_imu=BODY_P_IMU, interpolation="linear", **dvl):
 
 
 def moved_by(way: Way, imu: Imu, dvl: Dvl, bias=(0.0, 0.0, 0.0), earth=None, known=None) -> PreintegratedMotion:
-    known = calibration(interpolation=way.interpolation, **(known or {}))
+    walk = STEADY if way.is_blind else ANY_VELOCITY
+    known = calibration(interpolation=way.interpolation, **{"velocity_walk_density": walk, **(known or {})})
     return motion(blinded(imu) if way.is_blind else imu, dvl, known, way.start_s, way.until_s, bias, earth)
 
 

@@ -94,7 +94,21 @@ def attitudes_and_heights(pose: gtsam.Pose3, rng: np.random.Generator) -> Made:
     yield factors.position(X(0), fix, np.array([0.3, -0.2, 0.5]), random_covariance(3, 0.4), plain), values
 
 
-@pytest.mark.parametrize("made_at", [beginnings, odometries, sightings, attitudes_and_heights])
+def fixes_over_gaps(pose: gtsam.Pose3, rng: np.random.Generator) -> Made:
+    """Biases of the motion, far from them, and so far that the motion turns by nearly half a turn and by more."""
+    antenna = np.array([0.3, -0.2, 0.5])
+    motion = some_motion(int(rng.integers(99)), 0.05)
+    change = rng.standard_normal(len(motion.bias))
+    turn_rad = float(np.linalg.norm(motion.D_bias[:3] @ change))
+    for reach_rad in (0.0, 1e-7, 0.3, np.pi - 0.01, np.pi + 0.01):
+        bias = motion.bias + reach_rad / turn_rad * change
+        fix = pose.translation() + rng.standard_normal(3)
+        cov = random_covariance(3, 0.4)
+        factor = factors.position_with_biases((X(0), B(0)), fix, motion, antenna, cov, plain)
+        yield factor, values_of(X0=pose, B0=bias)
+
+
+@pytest.mark.parametrize("made_at", [beginnings, odometries, sightings, attitudes_and_heights, fixes_over_gaps])
 @poses
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=5)
