@@ -9,9 +9,8 @@ import gtsam
 import numpy as np
 from pydantic import Field
 
-from sonar_graph.calibration import Section
+from sonar_graph.calibration import Section, tagged
 from sonar_graph.measurements import Floats
-from sonar_graph.tagged_sections import tagged
 
 Robust = Callable[[gtsam.noiseModel.Base], gtsam.noiseModel.Base]
 """Wraps a noise model in a robust kernel, or returns it as it is."""
@@ -76,7 +75,8 @@ class RobustKernel(Kernel):
 
     def loss(self, e: Floats) -> Floats:
         """The loss of errors in standard deviations."""
-        k, size = self.width, np.abs(e)
+        k = self.width
+        size = np.abs(e)
         if self.shape == "huber":
             return np.where(size <= k, 0.5 * size**2, k * (size - 0.5 * k))
         return np.asarray(0.5 * k**2 * np.log1p((size / k) ** 2))

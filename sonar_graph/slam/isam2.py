@@ -18,7 +18,7 @@ import numpy as np
 from gtsam.symbol_shorthand import L, X
 from pydantic import model_validator
 
-from sonar_graph.calibration import Calibration, Section, require_params
+from sonar_graph.calibration import Calibration, Section, misfits, require_params
 from sonar_graph.errors import CalibrationError, EstimatorError
 from sonar_graph.measurements import (
     NS_PER_S,
@@ -45,7 +45,6 @@ from sonar_graph.slam.smoother import (
     WholeHistory,
 )
 from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, Refusal, RefusedRow, Trajectory
-from sonar_graph.tagged_sections import misfits
 
 Over = Literal["window", "history"]
 MOST_LISTED = 12

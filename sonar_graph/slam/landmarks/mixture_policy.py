@@ -19,6 +19,7 @@ import numpy as np
 from gtsam.symbol_shorthand import L
 from pydantic import Field
 
+from sonar_graph.calibration import tagged
 from sonar_graph.measurements import NO_TRACK, NS_PER_S, LandmarkDetections
 from sonar_graph.models import Kernel, locate
 from sonar_graph.slam.estimates import Solution
@@ -43,7 +44,6 @@ from sonar_graph.slam.landmarks.sighting import Frame, SeenFrame, Sighting, late
 from sonar_graph.slam.landmarks.tracked import GatedIdentity, RobustIdentity, second_rows_of_tracks
 from sonar_graph.slam.smoother import Marginals, Sightline, solve_in_sight
 from sonar_graph.states import Outcome
-from sonar_graph.tagged_sections import tagged
 
 MOST_WINDOW_ROUNDS = 3
 """Times that the choices of the window are revised after one frame."""

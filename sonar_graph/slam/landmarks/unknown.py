@@ -28,7 +28,7 @@ from gtsam.symbol_shorthand import L
 from numpy.typing import NDArray
 from pydantic import Field
 
-from sonar_graph.calibration import Section
+from sonar_graph.calibration import Section, tagged
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats, LandmarkDetections
 from sonar_graph.models import gate_threshold, locate_jacobians, range_azimuth_jacobians, wrap_angle
@@ -44,7 +44,6 @@ from sonar_graph.slam.landmarks.sighting import Frame, SeenFrame, Sighting, Sigh
 from sonar_graph.slam.prediction import PredictedView, Source
 from sonar_graph.slam.smoother import JointCovariance, Known
 from sonar_graph.states import FIRST_ANONYMOUS_ID, Outcome
-from sonar_graph.tagged_sections import tagged
 
 UNPAIRED = -1
 
