@@ -1,4 +1,4 @@
-"""Range and azimuth of a landmark: the model, its derivatives and its inverse.
+"""Detections of the sonar: range and azimuth of a landmark with derivatives and inverse; accepted identities.
 
 With q the landmark in sonar axes, x along the centre of the aperture, y to the left, z up, h its distance from z::
 
@@ -24,8 +24,9 @@ from typing import Any, NamedTuple, TypeVar
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
-from sonar_graph.measurements import Floats
+from sonar_graph.measurements import Floats, Ints, LandmarkDetections
 from sonar_graph.numerics import (
     UPPER_RIGHT,
     Mat3,
@@ -43,6 +44,7 @@ from sonar_graph.numerics import (
     store_row6,
     vec,
 )
+from sonar_graph.states import OUTCOME_NUMBERS, Outcome
 
 FLOOR_GATE = 10.83
 """Gate for "the landmark stands on the floor": the 0.999 quantile of chi-square with one degree of freedom.
@@ -305,3 +307,50 @@ def floor_elevation(up: Floats, height_m: float, range_m: float, azimuth_rad: fl
     one = wrap_angle(middle + half)
     other = wrap_angle(middle - half)
     return one if abs(one) <= abs(other) else other
+
+
+ACCEPTED = -1
+"""In place of an outcome."""
+MINIMUM_PROBABILITY = 0.7
+"""Default of every estimator: a wrong identity, which may spoil a landmark for good, weighs more than a lost one."""
+NO_IDENTITY = OUTCOME_NUMBERS[Outcome.NO_IDENTITY]
+REPEATED = OUTCOME_NUMBERS[Outcome.REPEATED]
+UNSOUND = OUTCOME_NUMBERS[Outcome.UNSOUND]
+
+
+def identify(detections: LandmarkDetections, minimum_probability: float) -> tuple[Ints, NDArray[np.int8]]:
+    """Most probable identity of each row, shape (n,), and `ACCEPTED` or the `OUTCOME_NUMBERS` of its refusal, (n,).
+
+    Refused is an unsound row, and a posterior that is too low or NaN, or of no identity (-1). A landmark is in one
+    place: of several rows of one frame with one identity the most probable is accepted, the first of equals.
+    """
+    ids = np.empty(len(detections), np.int64)
+    outcomes = np.full(len(detections), ACCEPTED, np.int8)
+    outcomes[~detections.are_sound()] = UNSOUND
+    rows = (detections.stamps_ns, detections.candidate_ids, detections.id_probability)
+    _write_identities(*rows, minimum_probability, ids, outcomes)
+    return ids, outcomes
+
+
+@compiled
+def _write_identities(
+    stamps_ns: Ints, candidates: Ints, posterior: Floats, minimum: float, ids: Ints, outcomes: NDArray[np.int8]
+) -> None:
+    """Fill what `identify` returns; outcomes other than `ACCEPTED` stay."""
+    p = np.empty(len(ids))
+    for row in range(len(ids)):
+        best = 0
+        for k in range(1, candidates.shape[1]):
+            if posterior[row, k] > posterior[row, best]:
+                best = k
+        ids[row] = candidates[row, best]
+        p[row] = posterior[row, best]
+        # not (p >= minimum): a NaN is refused too
+        if outcomes[row] == ACCEPTED and not (p[row] >= minimum and ids[row] >= 0):
+            outcomes[row] = NO_IDENTITY
+        # rows of one frame follow each other
+        other = row - 1
+        while other >= 0 and stamps_ns[other] == stamps_ns[row]:
+            if ids[other] == ids[row] and outcomes[other] == ACCEPTED and outcomes[row] == ACCEPTED:
+                outcomes[row if p[row] <= p[other] else other] = REPEATED
+            other -= 1

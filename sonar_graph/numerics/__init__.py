@@ -6,10 +6,9 @@ from sonar_graph.numerics.compiling import compiling_s
 from sonar_graph.numerics.jit import compilable, compiled, inlined
 from sonar_graph.numerics.matrices import (
     I3, LOWER_LEFT, LOWER_RIGHT, O3, UPPER_RIGHT, ZERO, Mat3, Mat6, Vec3, Vec6, chord_inverse,
-    cross, curvature, diagonal, exp_and_mean, mat, mat6, outer, quaternion,
-    rodrigues, rotation_log, skew, store, store6, store_all, store_row, store_row6, store_vector, vec,
+    cross, cross_matrix, curvature, diagonal, exp_and_mean, mat, mat6, outer, quaternion, rodrigues, rotation_log,
+    running_rotations, skew, store, store6, store_all, store_row, store_row6, store_vector, vec,
 )
-from sonar_graph.numerics.rotations import cross_matrix, running_rotations
 
 __all__ = [
     "I3", "LOWER_LEFT", "LOWER_RIGHT", "Mat3", "Mat6", "O3", "UPPER_RIGHT", "Vec3", "Vec6", "ZERO",

@@ -94,7 +94,7 @@ class Linearisation(NamedTuple):
     """Where motions from a keyframe are linearised."""
 
     biases: Floats
-    """b of `sonar_graph.models.biases`, shape (11,)."""
+    """b of `sonar_graph.models.aiding`, shape (11,)."""
     attitude: Floats
     """world_R_body, shape (3, 3)."""
 
