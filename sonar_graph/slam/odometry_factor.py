@@ -47,13 +47,13 @@ from sonar_graph.numerics import (
     rodrigues,
     rotation_log,
     skew,
+    store_all,
+    store_row6,
     vec,
 )
 from sonar_graph.slam.factors import ORIGIN, gaussian, poses_of
 
 UNIT = gtsam.noiseModel.Unit.Create(6)
-
-
 UNWHITENED = np.eye(6)[None]
 
 
@@ -173,7 +173,7 @@ def odometry_errors(
     errors = np.empty((len(i_T_j), 6))
     for k in range(len(i_T_j)):
         e = evaluated(X_i[k], X_j[k], changes[k], i_T_j[k], D[k], h[k])[0]
-        store_vector(mat6(whitening[k]) @ e, errors[k])
+        store_row6(mat6(whitening[k]) @ e, errors, k, 0)
     return errors
 
 
@@ -191,9 +191,9 @@ def odometry_derivatives(
         e, E, turned, c, turn, up = evaluated(X_i[k], X_j[k], changes[k], i_T_j[k], D[k], h[k])
         W = mat6(whitening[k])
         J = W @ log_derivative(e.a, E[1])
-        store_vector(W @ e, errors[k])
-        store_columns(J @ inverse_adjoint(turned), -1.0, by_i[k])
-        store_columns(J @ Mat6(I3, O3, O3, turn.T), 1.0, by_j[k])
+        store_row6(W @ e, errors, k, 0)
+        store_all((-1.0 * J @ inverse_adjoint(turned)).T, by_i[k])
+        store_all((J @ Mat6(I3, O3, O3, turn.T)).T, by_j[k])
         # J(c)^-1 has the blocks V^T, 0, -V^T B, V^T
         tilt, way = c
         V_T = exp_and_mean(tilt)[1].T
@@ -204,7 +204,7 @@ def odometry_derivatives(
             a = V_T @ vec(D[k, :3, m])
             column = by_c @ Vec6(a, V_T @ vec(D[k, 3:, m]) - V_T_B @ a)
             h_m = h[k, m]
-            store_vector(Vec6(-1.0 * column.a - h_m * by_psi.a, -1.0 * column.b - h_m * by_psi.b), by_b[k, m])
+            store_row6(Vec6(-1.0 * column.a - h_m * by_psi.a, -1.0 * column.b - h_m * by_psi.b), by_b[k], m, 0)
     return errors, by_i, by_j, by_b
 
 
@@ -261,22 +261,6 @@ def inverse_adjoint(T: tuple[Mat3, Vec3]) -> Mat6:
     """``Ad(T^-1)``."""
     R, t = T
     return Mat6(R.T, O3, -1.0 * (R.T @ skew(t)), R.T)
-
-
-@inlined
-def store_vector(v: Vec6, out: Floats) -> None:
-    """Write a vector into an array."""
-    out[0], out[1], out[2] = v.a
-    out[3], out[4], out[5] = v.b
-
-
-@inlined
-def store_columns(A: Mat6, sign: float, out: Floats) -> None:
-    """Write a matrix into an array, transposed and with a sign."""
-    T = A.T
-    for r, (left, right) in enumerate(((T.a, T.b), (T.c, T.d))):
-        for i, (v, w) in enumerate(((left.x, right.x), (left.y, right.y), (left.z, right.z))):
-            store_vector(Vec6(sign * v, sign * w), out[3 * r + i])
 
 
 def pose_row(pose: gtsam.Pose3) -> Floats:
