@@ -78,7 +78,8 @@ def gravity_direction(
 
 def up_direction(force: Floats, i_R_j: Floats, velocity_i: Floats, velocity_j: Floats, duration_s: float) -> Floats:
     """up_j of the mean specific force in frame i, shape (3,); NaN where the force is not measured."""
-    g_i = force - (i_R_j @ velocity_j - velocity_i) / duration_s
+    # the force that holds the vehicle against gravity: what is left without its acceleration
+    g_i = force - (i_R_j @ velocity_j - velocity_i) / duration_s  # (3,)
     return i_R_j.T @ g_i / math.sqrt(g_i @ g_i)
 
 
@@ -106,8 +107,8 @@ that is far off finds its way, which a kernel that lets go of large errors does 
 
 def yaw_and_derivative(R: Floats) -> tuple[float, Floats]:
     """Yaw of a rotation, rad, and its derivative by a turn of the body, shape (3,)."""
-    x, a, c = R[0, 0], R[0, 1], R[0, 2]
-    y, b, d = R[1, 0], R[1, 1], R[1, 2]
+    x, a, c = R[0]
+    y, b, d = R[1]
     level2 = x * x + y * y
     return math.atan2(y, x), np.array([0.0, (y * c - x * d) / level2, (x * b - y * a) / level2])
 

@@ -59,6 +59,7 @@ Angle = TypeVar("Angle", float, Floats)
 @compilable
 def wrap_angle(angle_rad: Angle) -> Angle:
     """The same direction in (-pi, pi], of one angle or of an array."""
+    # ceil, not floor: pi stays pi
     turns: Any = np.ceil((angle_rad - math.pi) / (2.0 * math.pi))
     return angle_rad - 2.0 * math.pi * turns
 
@@ -75,7 +76,7 @@ class Polar(NamedTuple):
 @inlined
 def polar(q: Vec3) -> Polar:
     """Range, azimuth and D_q of a point in the sonar frame."""
-    h2 = q.x * q.x + q.y * q.y
+    h2 = q.x * q.x + q.y * q.y  # h^2
     range_m = math.sqrt(h2 + q.z * q.z)
     return Polar(
         range_m=range_m,
@@ -221,7 +222,7 @@ def locate_from_body(
     body_R_sonar = mat(mount.body_R_sonar)
     q = vec(mount.body_p_sonar) + body_R_sonar @ _point_at(z[0], z[1], elevation_rad)  # in body axes
     p = vec(X) + world_R_body @ q
-    by_body = np.empty((3, 6))
+    by_body = np.empty((3, 6))  # R [-[q]x  I]
     store(-1.0 * (world_R_body @ skew(q)), by_body)
     store(world_R_body, by_body, UPPER_RIGHT)
     by_polar = np.empty((3, 3))
@@ -302,7 +303,8 @@ def floor_elevation(up: Floats, height_m: float, range_m: float, azimuth_rad: fl
     is_reached = reach_m > 0.0 and abs(height_m) <= reach_m  # False for a NaN height: the floor is not known
     if not is_reached:
         return math.nan
-    middle = math.atan2(up[2], level)
+    # the solutions are e0 - half and e0 + half, where the ray of elevation e0 climbs most steeply
+    middle = math.atan2(up[2], level)  # e0
     half = math.acos(height_m / reach_m)
     one = wrap_angle(middle + half)
     other = wrap_angle(middle - half)
