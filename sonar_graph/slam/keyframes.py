@@ -38,6 +38,7 @@ from sonar_graph.motion import MotionSource, PreintegratedMotion
 from sonar_graph.numerics import cross_matrix
 from sonar_graph.slam import factors
 from sonar_graph.slam.odometry_factor import OdometryWithBias
+from sonar_graph.slam.prediction import Tie
 from sonar_graph.slam.smoother import Changed, Known, Smoother
 from sonar_graph.states import Refusal, RefusedRow
 
@@ -212,6 +213,10 @@ class Keyframes:
     def newest_key(self) -> int:
         """Key of the newest keyframe."""
         return X(len(self.stamps_ns) - 1)
+
+    def tie(self, motion: PreintegratedMotion) -> Tie:
+        """An instant that the motion from the newest keyframe leads to."""
+        return Tie(self.newest_key, self.bias_keys[-1], motion)
 
     def oldest_key(self, age_s: float) -> int:
         """Key of the first keyframe that is not older than the newest by more than an age (s)."""

@@ -28,9 +28,8 @@ import gtsam
 from gtsam.symbol_shorthand import L
 
 from sonar_graph.measurements import Floats, LandmarkDetections
-from sonar_graph.slam.estimates import Solution
 from sonar_graph.slam.landmarks.sighting import Frame, SeenFrame, Sighting, SightingFactors
-from sonar_graph.slam.smoother import Changed, FactorGroup, Smoother
+from sonar_graph.slam.smoother import Changed, FactorGroup, Known, Marginals, Smoother
 from sonar_graph.states import OUTCOME_NUMBERS, UNKNOWN, DetectionJournal, DetectionLog, Outcome
 
 IN_GRAPH = frozenset(
@@ -97,6 +96,15 @@ class Decision:
 
 
 UNCHANGED = Decision()
+
+
+class Solution(NamedTuple):
+    """Solution of the whole graph."""
+
+    values: Known
+    marginals: Marginals
+    ids: list[int]
+    """Landmarks in it, ascending."""
 
 
 class IdentityPolicy:

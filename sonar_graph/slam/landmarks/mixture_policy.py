@@ -22,13 +22,13 @@ from pydantic import Field
 from sonar_graph.calibration import tagged
 from sonar_graph.measurements import NO_TRACK, NS_PER_S, LandmarkDetections
 from sonar_graph.models import Kernel, locate
-from sonar_graph.slam.estimates import Solution
 from sonar_graph.slam.landmarks.landmark_graph import (
     UNCHANGED,
     Assignment,
     Decision,
     IdentityPolicy,
     LandmarkGraph,
+    Solution,
 )
 from sonar_graph.slam.landmarks.mixture import (
     Choices,
