@@ -64,6 +64,13 @@ def wrap_angle(angle_rad: Angle) -> Angle:
     return angle_rad - 2.0 * math.pi * turns
 
 
+def polar_difference(z: Floats, expected: Floats) -> Floats:
+    """``z - expected`` of ranges (m) and azimuths (rad, wrapped), shape (..., 2)."""
+    e = z - expected
+    e[..., 1] = wrap_angle(e[..., 1])
+    return e
+
+
 class Polar(NamedTuple):
     """Range and azimuth of a point q in the sonar frame, and the rows of D_q."""
 

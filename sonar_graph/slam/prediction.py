@@ -26,7 +26,7 @@ import gtsam
 import numpy as np
 
 from sonar_graph.measurements import Floats
-from sonar_graph.models import view_points, wrap_angle
+from sonar_graph.models import polar_difference, view_points
 from sonar_graph.motion import PreintegratedMotion
 from sonar_graph.numerics import cross_matrix
 from sonar_graph.slam.smoother import JointCovariance, Known, Marginals
@@ -278,8 +278,7 @@ class PredictedView:
 
 def weigh(z: Floats, expected: Floats, prior_cov: Floats, cov: Floats) -> Compared:
     """Compare m detections and their noise with the expectation and its covariance."""
-    innovation = z - expected
-    innovation[:, 1] = wrap_angle(innovation[:, 1])
+    innovation = polar_difference(z, expected)
     S = prior_cov + cov
     r, alpha = innovation.T
     a, b, _, c = S.reshape(-1, 4).T
