@@ -11,11 +11,10 @@ from sonar_graph.models.sonar import (
     identify, locate, locate_from_body, locate_jacobians, polar_difference, project, project_points, range_azimuth,
     range_azimuth_jacobians, sight_of, sonar_point, view_points, wrap_angle,
 )
-from sonar_graph.numerics import gate_threshold
 
 __all__ = [
     "ACCEL", "ACCEPTED", "bias_jacobian", "bias_sigmas", "BIASES", "body_point_jacobian", "by_biases", "COMPASS",
-    "Contradictions", "elevation_on_floor", "floor_elevation", "FLOOR_GATE", "gate_threshold", "GaussianKernel",
+    "Contradictions", "elevation_on_floor", "floor_elevation", "FLOOR_GATE", "GaussianKernel",
     "gravity_direction", "gyro_bias_of", "HEADING", "huber_scale", "HUBER_WIDTHS", "identify", "Kernel", "KernelParams",
     "locate", "locate_from_body", "locate_jacobians", "MINIMUM_PROBABILITY", "Mount", "polar_difference", "project",
     "project_points", "range_azimuth", "range_azimuth_jacobians", "Robust", "RobustKernel", "SCALE", "sight_of",

@@ -8,8 +8,11 @@ from scipy.special import chdtr, chdtri, gammaincinv
 from sonar_graph.measurements import Floats
 
 
+@cache  # gates use the same few at every frame
 def chi_square_quantile(probability: float, dof: float) -> float:
     """Value that a chi-square variable of so many degrees of freedom stays below with this probability.
+
+    As a gate: the squared Mahalanobis distance that a true innovation of ``dof`` components stays below.
 
     Examples
     --------
@@ -29,9 +32,3 @@ def chi_square_exceeded(probability: float, dof: float) -> float:
 def chi_square_share(values: Floats, dof: float) -> Floats:
     """Probability that a chi-square variable stays below each of the values, of the same shape."""
     return np.asarray(chdtr(dof, values), np.float64)
-
-
-@cache
-def gate_threshold(probability: float, dof: int) -> float:
-    """Squared Mahalanobis distance that a true innovation of ``dof`` components stays below with this probability."""
-    return chi_square_quantile(probability, dof)

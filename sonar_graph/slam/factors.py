@@ -8,8 +8,9 @@
                    └── range, azimuth ── L7 ── floor prior
     depth, gravity direction and the planar constraint: one keyframe each
 
-Equations and derivatives are those of `sonar_graph.models`, or of GTSAM's compiled factors. Only odometry with biases
-(`odometry_factor`) and correlated noise (`sighting_factor`) have factors of their own, gravity and heading callbacks.
+Equations and derivatives are those of `sonar_graph.models`, or of GTSAM's compiled factors. Odometry with biases
+(`odometry_factor`) and correlated noise (`CorrelatedSighting`) have factors of their own; gravity, headings and fixes
+whose motion depends on biases have callbacks.
 
 Range and azimuth are two factors, so that elevation stays unknown: ``RangeFactorWithTransform3D``, and a camera whose
 optical axis lies in the sonar's fan plane along the measured azimuth. The camera has the equidistant projection

@@ -74,6 +74,7 @@ class Frontend:
         tie: Tie | None = None
         taken: set[int] = set()
         for policy, part in self._shared(frame):
+            # first, so that the frame is compared with an estimate without the wrong identities
             self._apply(policy.retract(part))
             self._apply(policy.associate(part))
             if part is None:
@@ -122,7 +123,7 @@ class Frontend:
 
     def _screened(self, detections: LandmarkDetections) -> Frame | None:
         """Detections that may become sightings. Every row enters the journal, a refused one with its reason."""
-        if not self._uses_tracks:
+        if not self._uses_tracks:  # without waiting, each detection is judged alone
             detections = replace(detections, track=np.full(len(detections), NO_TRACK))
         stamp_ns = int(detections.stamps_ns[0])
         ids = detections.most_probable()[0].tolist()

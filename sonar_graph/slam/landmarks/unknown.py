@@ -31,7 +31,8 @@ from pydantic import Field
 from sonar_graph.calibration import Section, tagged
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats, LandmarkDetections
-from sonar_graph.models import gate_threshold, locate_jacobians, polar_difference, range_azimuth_jacobians
+from sonar_graph.models import locate_jacobians, polar_difference, range_azimuth_jacobians
+from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.slam.keyframes import Keyframes
 from sonar_graph.slam.landmarks.landmark_graph import (
     UNCHANGED,
@@ -119,7 +120,7 @@ class _Search:
     def __init__(self, innovations: Innovations, probability: float) -> None:
         count = len(innovations.innovation)
         self._innovations = innovations
-        self._gates = [0.0] + [gate_threshold(probability, 2 * (k + 1)) for k in range(count)]
+        self._gates = [0.0] + [chi_square_quantile(probability, 2 * (k + 1)) for k in range(count)]
         # a pair that is incompatible alone stays so in every pairing
         self._possible = [
             [j for j in np.argsort(row).tolist() if row[j] <= self._gates[1]] for row in innovations.distances()
@@ -426,7 +427,7 @@ def nearest_duplicates(
     distance = np.einsum("ki,ki->k", d, np.linalg.solve(S, d[..., None])[..., 0])  # d' S^-1 d
     for k in np.argsort(distance).tolist():
         stays, goes = pairs[k]
-        if distance[k] > gate_threshold(params.gate_probability, 3):
+        if distance[k] > chi_square_quantile(params.gate_probability, 3):
             return None  # nor is any later pair compatible
         is_dense = log_density(d[k, :2], S[k, :2, :2]) > params.log_rival
         in_one_frame = landmarks.stamps_ns(stays) & landmarks.stamps_ns(goes)
