@@ -67,7 +67,8 @@ def wrap_angle(angle_rad: Angle) -> Angle:
 def polar_difference(z: Floats, expected: Floats) -> Floats:
     """``z - expected`` of ranges (m) and azimuths (rad, wrapped), shape (..., 2)."""
     e = z - expected
-    e[..., 1] = wrap_angle(e[..., 1])
+    components = e.T  # a view with range and azimuth on the first axis; of one difference, plain numbers
+    components[1] = wrap_angle(components[1])
     return e
 
 

@@ -43,8 +43,8 @@ from sonar_graph.models import (
     body_point_jacobian,
     polar_difference,
     project_points,
-    range_azimuth_jacobians,
     up_and_derivative,
+    view_points,
     wrap_angle,
     yaw_and_derivative,
 )
@@ -72,24 +72,23 @@ UP = np.array([0.0, 0.0, 1.0])
 class SightingError:
     """Error of one factor, called by GTSAM."""
 
-    __slots__ = ("body_T_sonar", "keys", "z")
+    __slots__ = ("body_T_sonar", "by_body", "keys", "z")
 
     def __init__(self, keys: tuple[int, int], body_T_sonar: gtsam.Pose3, z: Floats) -> None:
         self.keys = keys
         self.z = z
         self.body_T_sonar = body_T_sonar
+        self.by_body = body_T_sonar.inverse().AdjointMap()  # constant: GTSAM calls thousands of times
 
     def __call__(self, _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:
         """Error, shape (2,), m and rad."""
         pose_key, landmark_key = self.keys
-        world_T_body = values.atPose3(pose_key)
-        expected, by_pose, by_landmark = range_azimuth_jacobians(
-            world_T_body, self.body_T_sonar, values.atPoint3(landmark_key)
-        )
+        world_T_sonar = values.atPose3(pose_key).compose(self.body_T_sonar)
+        view = view_points(world_T_sonar, values.atPoint3(landmark_key)[None])
         if jacobians is not None:
-            jacobians[0] = by_pose
-            jacobians[1] = by_landmark
-        return polar_difference(expected, self.z)
+            jacobians[0] = view.by_pose[0] @ self.by_body  # (2, 6)
+            jacobians[1] = view.by_point[0]  # (2, 3)
+        return polar_difference(view.z[0], self.z)
 
 
 class CorrelatedSighting(gtsam.CustomFactor):
@@ -140,7 +139,7 @@ class SightingStack:
         self._landmark_of = np.searchsorted(self._landmark_keys, [law.keys[1] for law in laws])
         self._body_R_sonar = sonars[:, :3, :3]
         self._body_p_sonar = sonars[:, :3, 3]
-        self._by_body = np.array([law.body_T_sonar.inverse().AdjointMap() for law in laws])
+        self._by_body = np.array([law.by_body for law in laws])
         self._z = np.array([law.z for law in laws])
         # a kernel wraps the noise whose square root whitens
         noises: list[Any] = [factor.noiseModel() for factor in factors]

@@ -204,11 +204,12 @@ def odometry_derivatives(
         V_T_B = V_T @ log_derivative(found.tilt, found.way).c
         by_c = J @ inverse_adjoint(found.E)
         by_psi = J @ Vec6(found.up, ZERO)
+        columns = by_b[k]
         for m in range(biases):
             a = V_T @ vec(D[k, :3, m])
             column = by_c @ Vec6(a, V_T @ vec(D[k, 3:, m]) - V_T_B @ a)
             h_m = h[k, m]
-            store_row6(Vec6(-1.0 * column.a - h_m * by_psi.a, -1.0 * column.b - h_m * by_psi.b), by_b[k], m, 0)
+            store_row6(Vec6(-1.0 * column.a - h_m * by_psi.a, -1.0 * column.b - h_m * by_psi.b), columns, m, 0)
     return errors, by_i, by_j, by_b
 
 
