@@ -1,7 +1,7 @@
 """Right-invariant EKF-SLAM with the biases of gyros and accelerometers in its state: equations and estimator.
 
 The state is a rotation and 1 + N points that turn with the world, one element of SE_{1+N}(3), and the biases b of
-`sonar_graph.models.biases`. The error is right-invariant::
+`sonar_graph.models.aiding`. The error is right-invariant::
 
     R = Exp(theta) R^,    x_k = Exp(theta) x_k^ + J_l(theta) xi_k,    b = b^ + beta                            (1)
 
@@ -120,7 +120,7 @@ class InvariantState(NamedTuple):
     points: Floats
     """Positions of the body and of the landmarks, shape (1 + N, 3), m."""
     bias: Floats
-    """b of `sonar_graph.models.biases`, shape (11,)."""
+    """b of `sonar_graph.models.aiding`, shape (11,)."""
     P: Floats
     """Covariance of xi, shape (17 + 3 N, 17 + 3 N)."""
     body_p_dvl: Floats

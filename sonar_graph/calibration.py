@@ -1,4 +1,4 @@
-"""Prior knowledge of vehicle and sensors: noise, mountings, gravity, the start.
+"""Prior knowledge of vehicle and sensors: noise, mountings, gravity, the start; sections of settings.
 
 A `Calibration` travels inside the log (a metadata record) or comes from a TOML or JSON file; every field has a unit
 in its name or docstring. Every estimator gets the same one.
@@ -8,10 +8,12 @@ from typing import Annotated, Any, Literal
 
 import gtsam
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic._internal._model_construction import ModelMetaclass
+from pydantic.fields import FieldInfo
+from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from sonar_graph.errors import EstimatorError, SettingError, expectation
+from sonar_graph.errors import MISFIT, EstimatorError, SettingError, expectation
 
 STANDARD_GRAVITY = 9.80665
 HOLE_INTERVALS, SHORTEST_HOLE_S = 5, 0.05
@@ -83,6 +85,32 @@ def require_params(params: object, kind: type[Section], name: str) -> None:
         raise EstimatorError(
             f"{name}: params: expected {kind.__name__} or None, not {given}; of a dict: {kind.__name__}(**params)"
         )
+
+
+def tagged(tag: str, default: str) -> tuple[FieldInfo, BeforeValidator]:
+    """Metadata of a union of sections that one of their fields tells apart; it has a default.
+
+    ``tag``: that field, with a literal text in each section; ``default``: its value where it is not given.
+    """
+
+    def with_tag(value: Any) -> Any:
+        if isinstance(value, str):
+            raise ValueError(f'expected a section with {tag} = "{value}"')
+        return {tag: default, **value} if isinstance(value, dict) else value
+
+    return Field(discriminator=tag), BeforeValidator(with_tag)
+
+
+def misfits(model: type[BaseModel], reasons: dict[str, str]) -> ValidationError:
+    """Error for a model's validator to raise where fields exclude each other.
+
+    ``reasons``: message for each field, so that the line in a file can be named.
+    """
+    found = [
+        InitErrorDetails(type=PydanticCustomError(MISFIT, "{reason}", {"reason": reason}), loc=(name,), input=None)
+        for name, reason in reasons.items()
+    ]
+    return ValidationError.from_exception_data(model.__name__, found)
 
 
 class Mounting(Section):

@@ -9,9 +9,8 @@ import gtsam
 import numpy as np
 from pydantic import Field
 
-from sonar_graph.calibration import Section
+from sonar_graph.calibration import Section, tagged
 from sonar_graph.measurements import Floats
-from sonar_graph.tagged_sections import tagged
 
 Robust = Callable[[gtsam.noiseModel.Base], gtsam.noiseModel.Base]
 """Wraps a noise model in a robust kernel, or returns it as it is."""
@@ -38,6 +37,7 @@ class Kernel(Section):
         """Logarithm of n, of a density ``n / sigma exp(-rho(e / sigma))``. A Cauchy kernel needs a width above 1."""
         from scipy.integrate import quad  # takes most of a second to load
 
+        # a numeric integral serves kernels of any shape
         area, _ = quad(lambda e: math.exp(-float(self.loss(np.array(e)))), -math.inf, math.inf)
         return -math.log(area)
 
@@ -76,9 +76,11 @@ class RobustKernel(Kernel):
 
     def loss(self, e: Floats) -> Floats:
         """The loss of errors in standard deviations."""
-        k, size = self.width, np.abs(e)
+        k = self.width
+        size = np.abs(e)
         if self.shape == "huber":
             return np.where(size <= k, 0.5 * size**2, k * (size - 0.5 * k))
+        # log1p keeps the digits of small errors, where the loss is that of Gaussian noise
         return np.asarray(0.5 * k**2 * np.log1p((size / k) ** 2))
 
     def estimator(self) -> gtsam.noiseModel.mEstimator.Base:

@@ -1,4 +1,4 @@
-"""Range and azimuth of a landmark: the model, its derivatives and its inverse.
+"""Detections of the sonar: range and azimuth of a landmark with derivatives and inverse; accepted identities.
 
 With q the landmark in sonar axes, x along the centre of the aperture, y to the left, z up, h its distance from z::
 
@@ -24,8 +24,9 @@ from typing import Any, NamedTuple, TypeVar
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
-from sonar_graph.measurements import Floats
+from sonar_graph.measurements import Floats, Ints, LandmarkDetections
 from sonar_graph.numerics import (
     UPPER_RIGHT,
     Mat3,
@@ -43,6 +44,7 @@ from sonar_graph.numerics import (
     store_row6,
     vec,
 )
+from sonar_graph.states import OUTCOME_NUMBERS, Outcome
 
 FLOOR_GATE = 10.83
 """Gate for "the landmark stands on the floor": the 0.999 quantile of chi-square with one degree of freedom.
@@ -57,8 +59,17 @@ Angle = TypeVar("Angle", float, Floats)
 @compilable
 def wrap_angle(angle_rad: Angle) -> Angle:
     """The same direction in (-pi, pi], of one angle or of an array."""
+    # ceil, not floor: pi stays pi
     turns: Any = np.ceil((angle_rad - math.pi) / (2.0 * math.pi))
     return angle_rad - 2.0 * math.pi * turns
+
+
+def polar_difference(z: Floats, expected: Floats) -> Floats:
+    """``z - expected`` of ranges (m) and azimuths (rad, wrapped), shape (..., 2)."""
+    e = z - expected
+    components = e.T  # a view with range and azimuth on the first axis; of one difference, plain numbers
+    components[1] = wrap_angle(components[1])
+    return e
 
 
 class Polar(NamedTuple):
@@ -73,7 +84,7 @@ class Polar(NamedTuple):
 @inlined
 def polar(q: Vec3) -> Polar:
     """Range, azimuth and D_q of a point in the sonar frame."""
-    h2 = q.x * q.x + q.y * q.y
+    h2 = q.x * q.x + q.y * q.y  # h^2
     range_m = math.sqrt(h2 + q.z * q.z)
     return Polar(
         range_m=range_m,
@@ -219,7 +230,7 @@ def locate_from_body(
     body_R_sonar = mat(mount.body_R_sonar)
     q = vec(mount.body_p_sonar) + body_R_sonar @ _point_at(z[0], z[1], elevation_rad)  # in body axes
     p = vec(X) + world_R_body @ q
-    by_body = np.empty((3, 6))
+    by_body = np.empty((3, 6))  # R [-[q]x  I]
     store(-1.0 * (world_R_body @ skew(q)), by_body)
     store(world_R_body, by_body, UPPER_RIGHT)
     by_polar = np.empty((3, 3))
@@ -300,8 +311,56 @@ def floor_elevation(up: Floats, height_m: float, range_m: float, azimuth_rad: fl
     is_reached = reach_m > 0.0 and abs(height_m) <= reach_m  # False for a NaN height: the floor is not known
     if not is_reached:
         return math.nan
-    middle = math.atan2(up[2], level)
+    # the solutions are e0 - half and e0 + half, where the ray of elevation e0 climbs most steeply
+    middle = math.atan2(up[2], level)  # e0
     half = math.acos(height_m / reach_m)
     one = wrap_angle(middle + half)
     other = wrap_angle(middle - half)
     return one if abs(one) <= abs(other) else other
+
+
+ACCEPTED = -1
+"""In place of an outcome."""
+MINIMUM_PROBABILITY = 0.7
+"""Default of every estimator: a wrong identity, which may spoil a landmark for good, weighs more than a lost one."""
+NO_IDENTITY = OUTCOME_NUMBERS[Outcome.NO_IDENTITY]
+REPEATED = OUTCOME_NUMBERS[Outcome.REPEATED]
+UNSOUND = OUTCOME_NUMBERS[Outcome.UNSOUND]
+
+
+def identify(detections: LandmarkDetections, minimum_probability: float) -> tuple[Ints, NDArray[np.int8]]:
+    """Most probable identity of each row, shape (n,), and `ACCEPTED` or the `OUTCOME_NUMBERS` of its refusal, (n,).
+
+    Refused is an unsound row, and a posterior that is too low or NaN, or of no identity (-1). A landmark is in one
+    place: of several rows of one frame with one identity the most probable is accepted, the first of equals.
+    """
+    ids = np.empty(len(detections), np.int64)
+    outcomes = np.full(len(detections), ACCEPTED, np.int8)
+    outcomes[~detections.are_sound()] = UNSOUND
+    rows = (detections.stamps_ns, detections.candidate_ids, detections.id_probability)
+    _write_identities(*rows, minimum_probability, ids, outcomes)
+    return ids, outcomes
+
+
+@compiled
+def _write_identities(
+    stamps_ns: Ints, candidates: Ints, posterior: Floats, minimum: float, ids: Ints, outcomes: NDArray[np.int8]
+) -> None:
+    """Fill what `identify` returns; outcomes other than `ACCEPTED` stay."""
+    p = np.empty(len(ids))
+    for row in range(len(ids)):
+        best = 0
+        for k in range(1, candidates.shape[1]):
+            if posterior[row, k] > posterior[row, best]:
+                best = k
+        ids[row] = candidates[row, best]
+        p[row] = posterior[row, best]
+        # not (p >= minimum): a NaN is refused too
+        if outcomes[row] == ACCEPTED and not (p[row] >= minimum and ids[row] >= 0):
+            outcomes[row] = NO_IDENTITY
+        # rows of one frame follow each other
+        other = row - 1
+        while other >= 0 and stamps_ns[other] == stamps_ns[row]:
+            if ids[other] == ids[row] and outcomes[other] == ACCEPTED and outcomes[row] == ACCEPTED:
+                outcomes[row if p[row] <= p[other] else other] = REPEATED
+            other -= 1

@@ -17,20 +17,27 @@ TELL_EVERY_S = 10.0
 
 
 class _Progress(event.Listener):
-    """Says what is compiled: first in the log, then on a line of the terminal, or every `TELL_EVERY_S` in the log."""
+    """Shows what is compiled: first in the log, then on a line of the terminal, or in the log every `TELL_EVERY_S`."""
 
     def __init__(self) -> None:
-        self._depth, self._count, self._told_s = 0, 0, 0.0
+        self._depth = 0
+        self._count = 0
+        self._told_s = 0.0
 
     def on_start(self, event: Any) -> None:
         if not _is_ours(event):
             return
-        dispatcher, now_s, terminal = event.data["dispatcher"], time.monotonic(), _terminal()
+        dispatcher = event.data["dispatcher"]
+        now_s = time.monotonic()
+        terminal = _terminal()
         if not self._count:
             self._told_s = now_s
+            # without an index no earlier run has compiled this file: the user waits, and should know why
             if not any(Path(dispatcher._cache.cache_path).glob("*.nbi")):
                 LOG.warning(NOTICE)
-        self._depth, self._count = self._depth + 1, self._count + 1
+        # compiled functions compile those that they call first
+        self._depth += 1
+        self._count += 1
         about = max(self._count, COMPILED_IN.total())
         line = f"compiling for the first use: {dispatcher.py_func.__name__} ({self._count} of about {about})"
         if terminal:
@@ -63,7 +70,9 @@ event.register("numba:compile", _Progress())  # type: ignore[no-untyped-call]  #
 class _Stopwatch(event.Listener, threading.local):
     """Seconds in which a thread compiles, loads what was compiled, or waits for another that does."""
 
-    depth, began_s, total_s = 0, 0.0, 0.0
+    depth = 0
+    began_s = 0.0
+    total_s = 0.0
 
     def on_start(self, _event: Any) -> None:
         if not self.depth:

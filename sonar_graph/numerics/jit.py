@@ -63,7 +63,7 @@ def _digest(module: dict[str, Any]) -> str:
     waiting = [module]
     while waiting:
         names = waiting.pop()
-        if names["__name__"] in parts:
+        if names["__name__"] in parts:  # modules may name each other in a circle
             continue
         numbers = sorted((name, repr(value)) for name, value in names.items() if isinstance(value, int | float))
         status = Path(names["__file__"]).stat()
@@ -77,5 +77,5 @@ def _digest(module: dict[str, Any]) -> str:
 
 @cache
 def _contents(path: str, _mtime_ns: int, _size: int) -> str:
-    """Digest of a file, read anew in a process when it has changed."""
+    """Digest of a file, read again in a process when the file has changed."""
     return hashlib.sha256(Path(path).read_bytes()).hexdigest()

@@ -1,7 +1,8 @@
-"""Vectors, 3 × 3 and 6 × 6 matrices with operators, and rotations: ``F @ P @ F.T + G @ C @ G.T`` as it is written.
+"""Vectors, 3 × 3 and 6 × 6 matrices with operators, and rotations: ``F @ P @ F.T + G @ C @ G.T`` as in the paper.
 
 They are tuples. Inside a compiled function they live in registers, where an array of nine numbers is an allocation that
-costs as much as a product; outside, the same operators are ordinary methods. Rotations follow Forster et al.,
+costs as much as a product; outside, the same operators are ordinary methods. The last two functions are for arrays that
+never enter compiled code. Rotations follow Forster et al.,
 "On-Manifold Preintegration", IEEE TRO 33(1), 2017, (3), (8).
 """
 
@@ -14,6 +15,7 @@ from typing import Any, NamedTuple
 import numba.extending
 import numpy as np
 from numba import types
+from scipy.spatial.transform import Rotation
 
 from sonar_graph.measurements import Floats
 from sonar_graph.numerics.jit import inlined
@@ -77,6 +79,7 @@ RULES: dict[str, dict[tuple[type, type], Callable[[Any, Any], Any]]] = {
         (float, Vec3): lambda a, b: Vec3(a * b.x, a * b.y, a * b.z),
         (float, Mat3): lambda a, b: Mat3(a * b.x, a * b.y, a * b.z),
         (float, Vec6): lambda a, b: Vec6(a * b.a, a * b.b),
+        (float, Mat6): lambda a, b: Mat6(a * b.a, a * b.b, a * b.c, a * b.d),
     },
     "matmul": {
         (Vec3, Vec3): lambda a, b: a.x * b.x + a.y * b.y + a.z * b.z,
@@ -100,6 +103,7 @@ TRANSPOSES: dict[type, Callable[[Any], Any]] = {
 
 def _applied(name: str, a: Any, b: Any) -> Any:
     kinds = (float if isinstance(a, float | int | np.number) else type(a)), type(b)
+    # NotImplemented: Python goes on to the operator of b
     return RULES[name][kinds](a, b) if kinds in RULES[name] else NotImplemented
 
 
@@ -226,22 +230,27 @@ def store6(A: Mat6, out: Floats) -> None:
 @inlined
 def exp_and_mean(phi: Vec3) -> tuple[Mat3, Mat3]:
     """``Exp(phi)`` and ``J_l(phi)``, the mean of ``Exp(s phi)`` over s in [0, 1]; by series below 0.05 rad."""
-    x = phi @ phi
-    if x < 2.5e-3:
+    x = phi @ phi  # squared angle
+    if x < 2.5e-3:  # 1 - cos and 1 - a cancel at small angles
         a = 1.0 - x * (1.0 / 6.0 - x * (1.0 / 120.0 - x / 5040.0))
         b = 0.5 - x * (1.0 / 24.0 - x * (1.0 / 720.0 - x / 40320.0))
         c = 1.0 / 6.0 - x * (1.0 / 120.0 - x * (1.0 / 5040.0 - x / 362880.0))
     else:
         angle = math.sqrt(x)
-        a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / x
+        a = math.sin(angle) / angle
+        b = (1.0 - math.cos(angle)) / x
         c = (1.0 - a) / x
+    # Exp(phi) = I + a [phi]x + b [phi]x^2  (3);  J_l(phi) = I + b [phi]x + c [phi]x^2, (8) with the other sign
     return rodrigues(phi, x, a, b), rodrigues(phi, x, b, c)
 
 
 @inlined
 def rodrigues(phi: Vec3, x: float, a: float, b: float) -> Mat3:
     """``I + a [phi]x + b [phi]x^2``, with ``[phi]x^2 = phi phi^T - x I`` and ``x = |phi|^2``."""
-    p, q, r, d = phi.x, phi.y, phi.z, 1.0 - b * x
+    p = phi.x
+    q = phi.y
+    r = phi.z
+    d = 1.0 - b * x
     return Mat3(
         Vec3(d + b * p * p, b * p * q - a * r, b * p * r + a * q),
         Vec3(b * q * p + a * r, d + b * q * q, b * q * r - a * p),
@@ -252,19 +261,27 @@ def rodrigues(phi: Vec3, x: float, a: float, b: float) -> Mat3:
 @inlined
 def quaternion(R: Mat3) -> tuple[Vec3, float]:
     """Quaternion of any length, scalar last and not negative, by its largest part (Shepperd, JGC 1(3), 1978)."""
-    xx, yy, zz = R.x.x, R.y.y, R.z.z
+    xx = R.x.x
+    yy = R.y.y
+    zz = R.z.z
+    # each branch is the quaternion times four times its largest part, so that nothing small is divided by
     across = Vec3(R.z.y - R.y.z, R.x.z - R.z.x, R.y.x - R.x.y)
     w2 = xx + yy + zz
     if w2 >= max(xx, yy, zz):
-        w, v = 1.0 + w2, across
+        w = 1.0 + w2
+        v = across
     elif xx >= yy and xx >= zz:
-        w, v = across.x, Vec3(1.0 + xx - yy - zz, R.x.y + R.y.x, R.x.z + R.z.x)
+        w = across.x
+        v = Vec3(1.0 + xx - yy - zz, R.x.y + R.y.x, R.x.z + R.z.x)
     elif yy >= zz:
-        w, v = across.y, Vec3(R.x.y + R.y.x, 1.0 + yy - zz - xx, R.y.z + R.z.y)
+        w = across.y
+        v = Vec3(R.x.y + R.y.x, 1.0 + yy - zz - xx, R.y.z + R.z.y)
     else:
-        w, v = across.z, Vec3(R.x.z + R.z.x, R.y.z + R.z.y, 1.0 + zz - xx - yy)
-    if w < 0.0:
-        w, v = -w, -1.0 * v
+        w = across.z
+        v = Vec3(R.x.z + R.z.x, R.y.z + R.z.y, 1.0 + zz - xx - yy)
+    if w < 0.0:  # q and -q are one rotation; this one turns by at most pi
+        w = -w
+        v = -1.0 * v
     return v, w
 
 
@@ -273,13 +290,14 @@ def rotation_log(R: Mat3) -> Vec3:
     """Rotation vector, at any angle."""
     v, w = quaternion(R)
     n = math.sqrt(v @ v)
+    # atan2, unlike acos of the trace, keeps its digits at small angles and near pi
     return (2.0 * math.atan2(n, w) / n if n > 0.0 else 0.0) * v
 
 
 @inlined
 def curvature(x: float) -> tuple[float, float]:
     """``a = (1 - y cot y) / x``, y half the angle of the square x, and its derivative by the angle, over the angle."""
-    if x < SERIES_RAD2:
+    if x < SERIES_RAD2:  # the differences below cancel, the second to the fourth order
         return 1.0 / 12.0 + x * (1.0 / 720.0 + x / 30240.0), 1.0 / 360.0 + x * (1.0 / 7560.0 + x / 201600.0)
     half = 0.5 * math.sqrt(x)
     g = half / math.tan(half)
@@ -291,3 +309,25 @@ def chord_inverse(theta: Vec3) -> Mat3:
     """``J_l(theta)^-1 = I - [theta]x / 2 + a [theta]x^2``, a as in `curvature`; its transpose is that of Log."""
     x = theta @ theta
     return rodrigues(theta, x, -0.5, curvature(x)[0])
+
+
+def cross_matrix(v: Floats) -> Floats:
+    """[v]x with ``[v]x w = v x w``, shape (3, 3)."""
+    m = np.zeros((3, 3))
+    m[0, 1] = -v[2]
+    m[0, 2] = v[1]
+    m[1, 0] = v[2]
+    m[1, 2] = -v[0]
+    m[2, 0] = -v[1]
+    m[2, 1] = v[0]
+    return m
+
+
+def running_rotations(turns: Floats) -> Floats:
+    """``I, Exp(turns[0]), Exp(turns[0]) Exp(turns[1]), ...`` of n rotation vectors, (n + 1, 3, 3), by doubling."""
+    products = Rotation.from_rotvec(np.concatenate([np.zeros((1, 3)), turns])).as_matrix()
+    span = 1
+    while span <= len(turns):  # each product spans so many turns, or all before it
+        products[span:] = products[:-span] @ products[span:]
+        span *= 2
+    return products

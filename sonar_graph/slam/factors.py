@@ -8,8 +8,9 @@
                    └── range, azimuth ── L7 ── floor prior
     depth, gravity direction and the planar constraint: one keyframe each
 
-Equations and derivatives are those of `sonar_graph.models`, or of GTSAM's compiled factors. Only odometry with biases
-(`odometry_factor`) and correlated noise (`sighting_factor`) have factors of their own, gravity and heading callbacks.
+Equations and derivatives are those of `sonar_graph.models`, or of GTSAM's compiled factors. Odometry with biases
+(`odometry_factor`) and correlated noise (`CorrelatedSighting`) have factors of their own; gravity, headings and fixes
+whose motion depends on biases have callbacks.
 
 Range and azimuth are two factors, so that elevation stays unknown: ``RangeFactorWithTransform3D``, and a camera whose
 optical axis lies in the sonar's fan plane along the measured azimuth. The camera has the equidistant projection
@@ -39,6 +40,8 @@ from sonar_graph.models import (
     COMPASS,
     HUBER_WIDTHS,
     Robust,
+    body_point_jacobian,
+    polar_difference,
     project_points,
     up_and_derivative,
     view_points,
@@ -46,9 +49,24 @@ from sonar_graph.models import (
     yaw_and_derivative,
 )
 from sonar_graph.motion import PreintegratedMotion
-from sonar_graph.numerics import cross_matrix
 
 UNIT = gtsam.noiseModel.Unit.Create(2)
+UNINFORMATIVE_M = 1e5
+UNINFORMATIVE_RAD = 1e3
+"""Sigmas that leave a direction to the other factors."""
+EXACT = 1e-9
+"""Sigma of a bias (rad/s, m/s²) that is zero."""
+STEADY = 1e-3
+"""Share of its sigma by which a bias without a walk may walk in a stretch."""
+CORRELATION_LIMIT = 1e-6
+"""Above it, range and azimuth noise are taken together."""
+EQUIDISTANT = gtsam.Cal3Fisheye(1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+"""Unit focal lengths; no skew, offset or distortion."""
+BEAM_R_CAMERA = gtsam.Rot3(np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]))
+"""Columns: image x to the left, image y up, optical axis along the beam."""
+ORIGIN = np.zeros(3)
+IMAGE_CENTRE = np.zeros(2)
+UP = np.array([0.0, 0.0, 1.0])
 
 
 class SightingError:
@@ -60,7 +78,7 @@ class SightingError:
         self.keys = keys
         self.z = z
         self.body_T_sonar = body_T_sonar
-        self.by_body = body_T_sonar.inverse().AdjointMap()
+        self.by_body = body_T_sonar.inverse().AdjointMap()  # constant: GTSAM calls thousands of times
 
     def __call__(self, _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:
         """Error, shape (2,), m and rad."""
@@ -68,15 +86,16 @@ class SightingError:
         world_T_sonar = values.atPose3(pose_key).compose(self.body_T_sonar)
         view = view_points(world_T_sonar, values.atPoint3(landmark_key)[None])
         if jacobians is not None:
-            jacobians[0] = view.by_pose[0] @ self.by_body
-            jacobians[1] = view.by_point[0]
-        e = view.z[0] - self.z
-        e[1] = wrap_angle(e[1])
-        return e
+            jacobians[0] = view.by_pose[0] @ self.by_body  # (2, 6)
+            jacobians[1] = view.by_point[0]  # (2, 3)
+        return polar_difference(view.z[0], self.z)
 
 
 class CorrelatedSighting(gtsam.CustomFactor):
-    """Range (m) and azimuth (rad) of a landmark, ``z``, shape (2,), with their noise, robust or not."""
+    """Range (m) and azimuth (rad) of a landmark, whose noises are correlated: ``h(X, L) - z``, azimuth wrapped.
+
+    ``z``: as measured, shape (2,); ``noise``: with a kernel or without.
+    """
 
     __slots__ = ("law",)
     Stack: ClassVar[type[SightingStack]]
@@ -122,6 +141,7 @@ class SightingStack:
         self._body_p_sonar = sonars[:, :3, 3]
         self._by_body = np.array([law.by_body for law in laws])
         self._z = np.array([law.z for law in laws])
+        # a kernel wraps the noise whose square root whitens
         noises: list[Any] = [factor.noiseModel() for factor in factors]
         is_robust = [isinstance(noise, gtsam.noiseModel.Robust) for noise in noises]
         self._robust = np.flatnonzero(is_robust)
@@ -143,10 +163,10 @@ class SightingStack:
         root = np.ones((len(view.e), 1))
         weights = [kernel.weight(d) for kernel, d in zip(self._kernels, view.lengths, strict=True)]
         root[self._robust, 0] = np.sqrt(weights)
-        D_q = root[..., None] * self._whitening @ view.D_q
+        D_q = root[..., None] * self._whitening @ view.D_q  # (n, 2, 3)
         q_x = -np.cross(view.q[:, None, :], np.eye(3))  # [q]x
-        by_pose = np.concatenate((D_q @ q_x, -D_q), axis=2) @ self._by_body
-        by_landmark = D_q @ view.world_R_sonar.transpose(0, 2, 1)
+        by_pose = np.concatenate((D_q @ q_x, -D_q), axis=2) @ self._by_body  # (n, 2, 6)
+        by_landmark = D_q @ view.world_R_sonar.transpose(0, 2, 1)  # (n, 2, 3)
         return [
             gtsam.JacobianFactor(pose, A_pose, landmark, A_landmark, rhs, UNIT)
             for (pose, landmark), A_pose, A_landmark, rhs in zip(
@@ -160,13 +180,12 @@ class SightingStack:
         R = poses[:, :9].reshape(-1, 3, 3)
         world_R_sonar = R @ self._body_R_sonar
         world_p_sonar = poses[:, 9:] + times(R, self._body_p_sonar)
+        # each landmark is read once, however many sightings it has
         points = np.array([values.atPoint3(key) for key in self._landmark_keys])[self._landmark_of]
         q = times(world_R_sonar.transpose(0, 2, 1), points - world_p_sonar)
-        # the same model as `view_points`, for sonars of different poses
+        # the same model, for all sonars at once
         predicted, D_q = project_points(np.ascontiguousarray(q))
-        e = predicted - self._z
-        e[:, 1] = wrap_angle(e[:, 1])
-        e = times(self._whitening, e)
+        e = times(self._whitening, polar_difference(predicted, self._z))
         return SightingViews(world_R_sonar, q, D_q, e, np.linalg.norm(e[self._robust], axis=1).tolist())
 
 
@@ -182,25 +201,8 @@ def poses_of(values: gtsam.Values, keys: NDArray[np.uint64]) -> Floats:
     """Poses of a graph by the keys of keyframes, shape (...): rows of R, and p, shape (..., 12)."""
     known = np.fromiter(values.keys(), np.uint64)
     poses = np.asarray(gtsam.utilities.extractPose3(values))  # by ascending key
+    # the highest byte of a key is its letter
     return poses[np.searchsorted(known[known >> np.uint64(56) == ord("x")], keys)]
-
-
-UNINFORMATIVE_M = 1e5
-UNINFORMATIVE_RAD = 1e3
-"""Sigmas that leave a direction to the other factors."""
-EXACT = 1e-9
-"""Sigma of a bias (rad/s, m/s²) that is zero."""
-STEADY = 1e-3
-"""Share of its sigma by which a bias without a walk may walk in a stretch."""
-CORRELATION_LIMIT = 1e-6
-"""Above it, range and azimuth noise are taken together."""
-EQUIDISTANT = gtsam.Cal3Fisheye(1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-"""Unit focal lengths; no skew, offset or distortion."""
-BEAM_R_CAMERA = gtsam.Rot3(np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]))
-"""Columns: image x to the left, image y up, optical axis along the beam."""
-ORIGIN = np.zeros(3)
-IMAGE_CENTRE = np.zeros(2)
-UP = np.array([0.0, 0.0, 1.0])
 
 
 def gaussian(cov: Floats) -> gtsam.noiseModel.Base:
@@ -217,7 +219,7 @@ def gaussian(cov: Floats) -> gtsam.noiseModel.Base:
     try:
         np.linalg.cholesky(cov)
         is_positive = bool(np.isfinite(cov).all())
-    except np.linalg.LinAlgError:
+    except np.linalg.LinAlgError:  # raised for an indefinite matrix, not for NaN
         is_positive = False
     if not is_positive:
         least = np.linalg.eigvalsh(np.nan_to_num(cov))[0]
@@ -295,15 +297,8 @@ def landmark_sighting(
         noise = robust(gtsam.noiseModel.Isotropic.Sigma(1, range_sigma_m))
         distance = gtsam.RangeFactorWithTransform3D(pose_key, landmark_key, range_m, noise, body_T_sonar)
         return {"azimuth": camera, "range": distance}
-    both = correlated_sighting(pose_key, landmark_key, body_T_sonar, z, cov, robust)
+    both = CorrelatedSighting(pose_key, landmark_key, body_T_sonar, z, robust(gaussian(cov)))
     return {"elevation": camera, "range and azimuth": both} if elevation_sigma_rad else {"range and azimuth": both}
-
-
-def correlated_sighting(
-    pose_key: int, landmark_key: int, body_T_sonar: gtsam.Pose3, z: Floats, cov: Floats, robust: Robust
-) -> gtsam.NoiseModelFactor:
-    """Range and azimuth whose noises are correlated, as one factor: ``h(X, L) - z``, azimuth wrapped."""
-    return CorrelatedSighting(pose_key, landmark_key, body_T_sonar, z, robust(gaussian(cov)))
 
 
 def first_direction(pose_key: int, landmark_key: int, body_p_landmark: Floats) -> gtsam.NonlinearFactor:
@@ -436,8 +431,8 @@ def position_with_biases(
         if jacobians is not None:
             R_i = world_T_i.rotation().matrix()
             R_j = R_i @ i_T_j.rotation().matrix()
-            jacobians[0] = R_i @ np.hstack((-cross_matrix(arm), np.eye(3)))
-            by_motion = R_j @ np.hstack((-cross_matrix(body_p_antenna), np.eye(3)))
+            jacobians[0] = body_point_jacobian(R_i, arm)
+            by_motion = body_point_jacobian(R_j, body_p_antenna)  # (3, 6)
             jacobians[1] = by_motion @ gtsam.Pose3.ExpmapDerivative(change) @ motion.D_bias
         return np.asarray(world_T_i.transformFrom(arm)) - position_m
 

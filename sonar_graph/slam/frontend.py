@@ -20,8 +20,6 @@ import numpy as np
 
 from sonar_graph.measurements import NO_TRACK, Floats, LandmarkDetections
 from sonar_graph.models import KernelParams
-from sonar_graph.motion import PreintegratedMotion
-from sonar_graph.slam.estimates import Solution
 from sonar_graph.slam.keyframes import Keyframes
 from sonar_graph.slam.landmarks import (
     AmendableJournal,
@@ -36,6 +34,7 @@ from sonar_graph.slam.landmarks import (
     NamelessLandmarks,
     SeenFrame,
     SightingFactors,
+    Solution,
     TrackedIdentities,
     unnamed,
 )
@@ -75,13 +74,14 @@ class Frontend:
         tie: Tie | None = None
         taken: set[int] = set()
         for policy, part in self._shared(frame):
+            # first, so that the frame is compared with an estimate without the wrong identities
             self._apply(policy.retract(part))
             self._apply(policy.associate(part))
             if part is None:
                 continue
-            newest = self._tie(self._keyframes.motion_since_newest(part.stamp_ns))
+            newest = self._keyframes.tie(self._keyframes.motion_since_newest(part.stamp_ns))
             if tie is None:  # once a frame: all its sightings hang on one keyframe
-                tie = self._tie(self._keyframes.set_for_frame(part.stamp_ns, newest.motion))
+                tie = self._keyframes.tie(self._keyframes.set_for_frame(part.stamp_ns, newest.motion))
             seen = self._predicted(policy, part, newest, tie, frozenset(taken))
             decision = policy.judge(seen)
             self._apply(decision)
@@ -123,7 +123,7 @@ class Frontend:
 
     def _screened(self, detections: LandmarkDetections) -> Frame | None:
         """Detections that may become sightings. Every row enters the journal, a refused one with its reason."""
-        if not self._uses_tracks:
+        if not self._uses_tracks:  # without waiting, each detection is judged alone
             detections = replace(detections, track=np.full(len(detections), NO_TRACK))
         stamp_ns = int(detections.stamps_ns[0])
         ids = detections.most_probable()[0].tolist()
@@ -176,10 +176,6 @@ class Frontend:
             return [(self.policy, frame)]
         is_nameless = unnamed(frame.detections)
         return [(self.policy, frame.select(~is_nameless)), (self._nameless, frame.select(is_nameless))]
-
-    def _tie(self, motion: PreintegratedMotion) -> Tie:
-        """A frame tied to the newest keyframe by the motion from there."""
-        return Tie(self._keyframes.newest_key, self._keyframes.bias_keys[-1], motion)
 
     def _predicted(
         self, policy: IdentityPolicy, frame: Frame, newest: Tie, tie: Tie, taken: frozenset[int]

@@ -18,7 +18,7 @@ import numpy as np
 from gtsam.symbol_shorthand import L, X
 from pydantic import model_validator
 
-from sonar_graph.calibration import Calibration, Section, require_params
+from sonar_graph.calibration import Calibration, Section, misfits, require_params
 from sonar_graph.errors import CalibrationError, EstimatorError
 from sonar_graph.measurements import (
     NS_PER_S,
@@ -31,10 +31,10 @@ from sonar_graph.measurements import (
 )
 from sonar_graph.models import KernelParams, RobustKernel
 from sonar_graph.motion import MotionSource, require_source
-from sonar_graph.slam.estimates import AnchoredPose, PoseHistory
 from sonar_graph.slam.frontend import Frontend
 from sonar_graph.slam.keyframes import KeyframeParams, Keyframes
 from sonar_graph.slam.landmarks import IdentityParams, MixtureIdentity, RobustIdentity
+from sonar_graph.slam.prediction import AnchoredPose, PoseHistory
 from sonar_graph.slam.smoother import (
     HistoryParams,
     JointCovariance,
@@ -45,7 +45,6 @@ from sonar_graph.slam.smoother import (
     WholeHistory,
 )
 from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, Refusal, RefusedRow, Trajectory
-from sonar_graph.tagged_sections import misfits
 
 Over = Literal["window", "history"]
 MOST_LISTED = 12
@@ -181,11 +180,9 @@ class Isam2:
 
     def _estimate(self, stamp_ns: int) -> Estimate:
         """Estimate at an instant: the newest keyframe's pose, carried on by odometry."""
-        newest = self.keyframe_count - 1
-        motion = self._keyframes.motion_since_newest(stamp_ns)
-        instant = AnchoredPose(stamp_ns, newest, self._keyframes.bias_keys[newest], motion)
+        instant = AnchoredPose(stamp_ns, self._keyframes.tie(self._keyframes.motion_since_newest(stamp_ns)))
         self._poses.add(instant)
-        joint = self._smoother.joint_covariance(instant.keys())
+        joint = self._smoother.joint_covariance(instant.tie.keys)
         return instant.carried_on(self._smoother.estimates, joint)
 
     def _frame_events(self, detections: LandmarkDetections | None) -> list[Event]:

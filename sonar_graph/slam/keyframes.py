@@ -29,15 +29,16 @@ from sonar_graph.models import (
     TILT,
     Contradictions,
     bias_sigmas,
+    body_point_jacobian,
     by_biases,
     gravity_direction,
     gyro_bias_of,
     wrap_angle,
 )
 from sonar_graph.motion import MotionSource, PreintegratedMotion
-from sonar_graph.numerics import cross_matrix
 from sonar_graph.slam import factors
 from sonar_graph.slam.odometry_factor import OdometryWithBias
+from sonar_graph.slam.prediction import Tie
 from sonar_graph.slam.smoother import Changed, Known, Smoother
 from sonar_graph.states import Refusal, RefusedRow
 
@@ -94,7 +95,7 @@ class Linearisation(NamedTuple):
     """Where motions from a keyframe are linearised."""
 
     biases: Floats
-    """b of `sonar_graph.models.biases`, shape (11,)."""
+    """b of `sonar_graph.models.aiding`, shape (11,)."""
     attitude: Floats
     """world_R_body, shape (3, 3)."""
 
@@ -145,7 +146,7 @@ def average_at_end(variance: Floats, wander: Floats) -> Average:
     P = np.inf
     for k, (r, q) in enumerate(zip(variance.tolist(), wander.tolist(), strict=True)):
         K = P / (P + r) if k else 1.0
-        weights *= 1.0 - K
+        weights *= 1.0 - K  # older samples share the odometry's error: they give way together
         weights[k] = K
         P = ((1.0 - K) * P if k else r) + q
     return Average(weights, P)
@@ -213,6 +214,10 @@ class Keyframes:
         """Key of the newest keyframe."""
         return X(len(self.stamps_ns) - 1)
 
+    def tie(self, motion: PreintegratedMotion) -> Tie:
+        """An instant that the motion from the newest keyframe leads to."""
+        return Tie(self.newest_key, self.bias_keys[-1], motion)
+
     def oldest_key(self, age_s: float) -> int:
         """Key of the first keyframe that is not older than the newest by more than an age (s)."""
         if not self.stamps_ns:
@@ -229,7 +234,7 @@ class Keyframes:
         after the keyframe of their time was set.
         """
         self.odometry.add(imu, dvl)
-        self._latest = None
+        self._latest = None  # rows that come later may change a provisional motion
         set_ns = self.stamps_ns[-1] if self.stamps_ns else EARLIEST_NS
         used_depth = self.odometry.used_depths(depth)
         if used_depth is not None:
@@ -246,6 +251,7 @@ class Keyframes:
 
     def _add_headings(self, heading: Heading, set_ns: int) -> None:
         is_sound = heading.are_sound()
+        # depths are judged by the odometry; headings here, in the order of their stamps
         is_late = (heading.stamps_ns <= set_ns) | (heading.stamps_ns < self._newest_heading_ns)
         for row in np.flatnonzero(~is_sound | is_late).tolist():
             reason = Refusal.LATE if is_sound[row] else Refusal.UNSOUND
@@ -292,7 +298,7 @@ class Keyframes:
 
     def _updated(self) -> Changed:
         changed = self.smoother.update(self.newest_s)
-        self._linearise()
+        self._linearise()  # at the estimate that contains the new keyframe
         return changed
 
     def _start(self, start_ns: int) -> None:
@@ -313,6 +319,7 @@ class Keyframes:
         Returns the motion from the keyframe that is newest then to the frame.
         """
         epochs_ns = self.odometry.epochs(self.stamps_ns[-1], stamp_ns)
+        # without an epoch since the newest keyframe there is no place for another
         if len(epochs_ns) and self._is_blurred(motion):
             self._set(int(epochs_ns[-1]), stamp_ns)
             self._linearise()
@@ -321,13 +328,15 @@ class Keyframes:
 
     def _is_blurred(self, motion: PreintegratedMotion) -> bool:
         """True when the variance of a motion exceeds ``motion_noise_share`` of the sonar's variance."""
-        by_noise = motion.covariance.diagonal()
-        by_biases_ = np.square(motion.D_bias) @ np.square(self._bias_sigmas)
-        variances = by_noise + by_biases_  # (6,)
+        variances = motion.covariance.diagonal() + self._by_biases(motion.D_bias)  # (6,)
         sonar = self.calibration.sonar
         turn_share = float(variances[:3].max()) / sonar.azimuth_sigma_rad**2
         way_share = float(variances[3:].max()) / sonar.range_sigma_m**2
         return max(turn_share, way_share) > self.params.motion_noise_share
+
+    def _by_biases(self, D: Floats) -> Floats:
+        """Variances that the biases cause by a derivative, as uncertain as at the start: shape (m, 11) to (m,)."""
+        return np.asarray(np.square(D) @ np.square(self._bias_sigmas))
 
     def _shared_over_gap(self, stamp_ns: int, motion: PreintegratedMotion) -> PreintegratedMotion:
         """The motion to a frame or fix, with a covariance that measurements over the same gap may share.
@@ -347,7 +356,7 @@ class Keyframes:
 
     def _set(self, node_ns: int, known_ns: int) -> None:
         """Set a keyframe at an epoch, from rows stamped no later than ``known_ns``."""
-        self._judge()
+        self._judge()  # before the new keyframe's factors enter
         i = len(self.stamps_ns) - 1
         j = i + 1
         start_ns = self.stamps_ns[i]
@@ -358,10 +367,12 @@ class Keyframes:
         self._add_odometry(i, motion, linearisation)
         self._add_gravity(j, node_ns, motion)
         self._add_averages(j, Interval(start_ns, node_ns, known_ns), linearisation)
+        # the factors up to here hold for the biases of keyframe i
         self.bias_keys.append(self._next_bias_key(i, node_ns))
         self.stamps_ns.append(node_ns)
         self._constrain(j)
         self.odometry.settle(node_ns)
+        # a late fix may need the motion from any keyframe of the lag
         oldest = bisect_left(self.stamps_ns, node_ns - self._lag_ns)
         self.odometry.forget_before(self.stamps_ns[oldest])
 
@@ -378,7 +389,7 @@ class Keyframes:
         new = B(gtsam.Symbol(old).index() + 1)
         self._bias_since_ns = node_ns
         self.smoother.add_bias(new, self.smoother.estimates.atVector(old))
-        by_walk = self._walks * np.sqrt(elapsed_s)
+        by_walk = self._walks * np.sqrt(elapsed_s)  # a random walk: the variance grows with time
         walked = np.where(self._walks > 0, by_walk, factors.STEADY * self._bias_sigmas)
         self.smoother.add({"bias walk": factors.bias_walk(old, new, walked)})
         return new
@@ -406,10 +417,12 @@ class Keyframes:
         up = self._up(attitude)
         gyro_bias = gyro_bias_of(biases, up)
         motion = self.odometry.motion(start_ns, end_ns, gyro_bias, attitude, known_ns)
+        # the odometry differentiates by the gyro bias alone, and has taken away no other
         dR = motion.i_T_j.rotation().matrix()
         D = by_biases(motion.D_bias, dR, motion.i_T_j.translation(), up, attitude[2], self._body_p_dvl)
-        removed = np.concatenate((gyro_bias, gyro_bias, np.zeros(BIASES - 6)))
+        removed = np.concatenate((gyro_bias, gyro_bias, np.zeros(BIASES - 6)))  # (11,)
         motion = replace(motion, D_bias=D, bias=removed)
+        # then to first order by the other biases
         return replace(motion, i_T_j=motion.corrected(biases), bias=biases)
 
     def _up(self, attitude: Floats) -> Floats:
@@ -419,7 +432,7 @@ class Keyframes:
     def _linearise(self) -> None:
         """Fix biases and attitude for the motions from a new keyframe at their estimates when it is set.
 
-        Fixed at the first question instead, they would depend on who asks.
+        If they were fixed at the first call that needs a motion, results would depend on the calls.
         """
         attitude = self.smoother.estimates.atPose3(self.newest_key).rotation().matrix()
         self._linearised = Linearisation(self.bias(len(self.stamps_ns) - 1), attitude)
@@ -430,7 +443,7 @@ class Keyframes:
     def _add_odometry(self, i: int, motion: PreintegratedMotion, linearisation: Linearisation) -> None:
         between: gtsam.NonlinearFactor
         if self._has_motion_biases:
-            up_j = self._up(linearisation.attitude) @ motion.i_T_j.rotation().matrix()
+            up_j = self._up(linearisation.attitude) @ motion.i_T_j.rotation().matrix()  # R^T up
             between = OdometryWithBias(X(i), X(i + 1), self.bias_keys[i], motion, up_j)
         else:
             between = factors.odometry(X(i), X(i + 1), motion)
@@ -442,6 +455,7 @@ class Keyframes:
         velocity_i, variance_i = self.odometry.velocity_at_imu(self.stamps_ns[-1])
         velocity_j, variance_j = self.odometry.velocity_at_imu(node_ns)
         sigma_m_s = float(np.sqrt(0.5 * (variance_i + variance_j)))
+        # the bias is a variable of the graph, or has no sigma: it is no noise of the direction
         direction = gravity_direction(motion, velocity_i, velocity_j, sigma_m_s, self.calibration, has_bias=False)
         if direction is None:
             return
@@ -493,6 +507,7 @@ class Keyframes:
     def _add_depth(self, j: int, depth: Depth, carried: Carried) -> None:
         """One factor for the averaged samples; at sample k the port lies at ``k_T_j^-1 port`` in frame j."""
         up_j = self.smoother.estimates.atPose3(X(j)).rotation().matrix()[2]
+        # only the part of the odometry's error along the vertical moves a depth
         ups = carried.k_R_j[1:] @ up_j  # (n, 3)
         wander_m2 = np.einsum("ka,kab,kb->k", ups, carried.C[:, 3:, 3:], ups)
         z_m = depth.z_m[carried.first :]
@@ -513,12 +528,13 @@ class Keyframes:
         R_j = self.smoother.estimates.atPose3(X(j)).rotation().matrix()
         R_k = R_j @ carried.k_R_j.transpose(0, 2, 1)
         yaw_rad = np.arctan2(R_k[:, 1, 0], R_k[:, 0, 0])
-        ups = carried.k_R_j[1:] @ R_j[2]
+        ups = carried.k_R_j[1:] @ R_j[2]  # (n, 3)
         wander_rad2 = np.einsum("ka,kab,kb->k", ups, carried.C[:, :3, :3], ups)
         innovation = wrap_angle(heading.yaw_rad[carried.first :] - yaw_rad[:-1] - compass_rad)
         given_rad = heading.sigma_rad[carried.first :]
         sigma_rad = np.where(np.isnan(given_rad), self.calibration.heading.sigma_rad, given_rad)
         off = np.abs(wrap_angle(innovation - np.median(innovation))) / (HUBER_WIDTHS[1] * sigma_rad)
+        # beyond k sigma the noise grows with the error: R d / k
         average = average_at_end(sigma_rad**2 * np.maximum(1.0, off), wander_rad2)
         measured_rad = float(yaw_rad[-1] + compass_rad + average.weights @ innovation)
         factor = factors.heading(X(j), self.bias_keys[-1], measured_rad, average.variance**0.5)
@@ -553,26 +569,27 @@ class Keyframes:
         world_R_i = self.smoother.estimates.atPose3(X(i)).rotation().matrix()
         if stamp_ns >= self.advanced_ns:
             motion = self._shared_over_gap(stamp_ns, self.motion_since_newest(stamp_ns))
-        else:
+        else:  # late: from an earlier keyframe, by rows that are known by now
             linearisation = Linearisation(self.bias(i), world_R_i)
             motion = self._motion(self.stamps_ns[i], stamp_ns, linearisation, self.advanced_ns)
         antenna = np.array(self.calibration.positions.antenna_m)
         arm = motion.i_T_j.transformFrom(antenna)
         world_R_fix = world_R_i @ motion.i_T_j.rotation().matrix()
-        by_motion = world_R_fix @ np.hstack((-cross_matrix(antenna), np.eye(3)))
-        noise_m2 = cov_m2 + by_motion @ motion.covariance @ by_motion.T
+        by_motion = body_point_jacobian(world_R_fix, antenna)  # (3, 6)
+        # the fix hangs on the keyframe: the error of the motion between them is noise
+        noise_m2 = cov_m2 + by_motion @ motion.covariance @ by_motion.T  # (3, 3)
         factor: gtsam.NonlinearFactor
-        by_biases_m2 = np.square(by_motion @ motion.D_bias) @ np.square(self._bias_sigmas)  # (3,)
+        by_biases_m2 = self._by_biases(by_motion @ motion.D_bias)  # (3,)
         if (by_biases_m2 > LEAST_BIAS_SHARE * noise_m2.diagonal()).any():
             keys = (X(i), self.bias_keys[i])
             factor = factors.position_with_biases(keys, position_m, motion, antenna, noise_m2)
         else:
             factor = factors.position(X(i), position_m, arm, noise_m2)
-        gain = np.inf
+        gain = np.inf  # enters at once
         if i == len(self.stamps_ns) - 1 and not self.smoother.is_due:
-            by_pose = world_R_i @ np.hstack((-cross_matrix(arm), np.eye(3)))
+            by_pose = body_point_jacobian(world_R_i, arm)
             P = self.smoother.joint_covariance([X(i)]).at(X(i), X(i))
-            predicted_m2 = by_pose @ P @ by_pose.T
+            predicted_m2 = by_pose @ P @ by_pose.T  # (3, 3)
             gain = FIX_GAIN * float((predicted_m2.diagonal() / noise_m2.diagonal()).max())
         self.smoother.add({"position": factor}, gain=gain)
 

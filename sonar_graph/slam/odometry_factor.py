@@ -3,16 +3,17 @@
 With ``i_T_j`` the preintegrated motion for the biases b_0, C its covariance and D its derivative by them, but for the
 turn ``psi = h (b - b_0)`` about the world's vertical u, seen in body j::
 
-    E = (i_T_j Exp(c))^-1 X_i^-1 X_j Exp(-psi u),    c = D (b - b_0),    e = Log(E) ~ N(0, C)
-    de/dX_i = -J(e) Ad(Exp(psi u) X_j^-1 X_i),    de/dX_j = J(e) [I, Exp(psi u)],    J: derivative of Log
-    de/db = -J(e) (Ad(E^-1) J(c)^-1 D + [u, 0] h)
+    E = (i_T_j Exp(c))^-1 X_i^-1 X_j Exp(-psi u),    c = D (b - b_0),    e = Log(E) ~ N(0, C)                  (1)
+    de/dX_i = -J(e) Ad(Exp(psi u) X_j^-1 X_i)         J: derivative of Log                                     (2)
+    de/dX_j = J(e) [I, Exp(psi u)]                                                                             (3)
+    de/db   = -J(e) (Ad(E^-1) J(c)^-1 D + [u, 0] h)                                                            (4)
 
 About a fixed axis of the body that turn would become a tilt as soon as the estimate tilts, and gravity would constrain
 it. With ``E = (R, t)``, ``theta = Log(R)`` and V the mean of ``Exp(s theta)`` over s in [0, 1]::
 
-    Log(E) = (theta, V^-1 t),    V^-1 = I - [theta]x / 2 + a [theta]x^2
+    Log(E) = (theta, V^-1 t),    V^-1 = I - [theta]x / 2 + a [theta]x^2                                        (5)
     a = (1 - y cot y) / |theta|^2,    y = |theta| / 2
-    J = [ V^-T   0   ]     B: derivative of V^-1 t by theta
+    J = [ V^-T   0   ]     B: derivative of V^-1 t by theta                                                    (6)
         [ B V^-T V^-T ]
 
 GTSAM has no compiled factor with these rows. It calls Python once for each factor, which takes as long as many compiled
@@ -33,6 +34,7 @@ from sonar_graph.motion import PreintegratedMotion
 from sonar_graph.numerics import (
     I3,
     O3,
+    ZERO,
     Mat3,
     Mat6,
     Vec3,
@@ -47,13 +49,13 @@ from sonar_graph.numerics import (
     rodrigues,
     rotation_log,
     skew,
+    store_all,
+    store_row6,
     vec,
 )
 from sonar_graph.slam.factors import ORIGIN, gaussian, poses_of
 
 UNIT = gtsam.noiseModel.Unit.Create(6)
-
-
 UNWHITENED = np.eye(6)[None]
 
 
@@ -65,13 +67,15 @@ class OdometryError:
     def __init__(self, keys: tuple[int, int, int], motion: PreintegratedMotion, up_j: Floats) -> None:
         self.keys = keys
         self.bias_0 = motion.bias
-        self.i_T_j = pose_row(motion.i_T_j)
+        i_R_j = motion.i_T_j.rotation().matrix()
+        self.i_T_j = np.concatenate((i_R_j.ravel(), motion.i_T_j.translation()))  # (12,)
         self.h = np.zeros(motion.D_bias.shape[1])
         self.h[HEADING] = up_j @ motion.D_bias[:3, HEADING]
         self.D = motion.D_bias.copy()
+        # the turn about the vertical is psi's alone
         self.D[:3] -= np.outer(up_j, self.h)
         self._motion = (self.i_T_j[None], self.D[None], self.h[None], UNWHITENED)
-        # GTSAM asks thousands of times: poses are written into arrays made once
+        # GTSAM calls thousands of times: poses are written into arrays made once
         self._poses = np.empty((2, 1, 12))
         self._R = self._poses[:, 0, :9].reshape(2, 3, 3)
         self._p = self._poses[:, 0, 9:]
@@ -82,12 +86,12 @@ class OdometryError:
             world_T_body = values.atPose3(self.keys[k]).matrix()  # (4, 4)
             self._R[k] = world_T_body[:3, :3]
             self._p[k] = world_T_body[:3, 3]
-        X_i, X_j = self._poses
-        change = (values.atVector(self.keys[2]) - self.bias_0)[None]
+        X_i, X_j = self._poses  # (1, 12) each
+        change = (values.atVector(self.keys[2]) - self.bias_0)[None]  # (1, 11)
         if jacobians is None:
             return odometry_errors(X_i, X_j, change, *self._motion)[0]
         e, by_i, by_j, by_b = odometry_derivatives(X_i, X_j, change, *self._motion)
-        jacobians[0] = by_i[0].T
+        jacobians[0] = by_i[0].T  # back to rows
         jacobians[1] = by_j[0].T
         jacobians[2] = by_b[0].T
         return np.asarray(e[0])
@@ -158,6 +162,7 @@ class OdometryStack:
     def _states(self, values: gtsam.Values) -> tuple[Floats, Floats, Floats]:
         """Poses at both ends, as rows of R, and p, shape (n, 12) each, and ``b - b_0``, shape (n, 11)."""
         X_i, X_j = poses_of(values, self._pose_keys)
+        # many motions share the biases of a stretch: each is read once
         biases = np.array([values.atVector(key) for key in self._bias_keys])
         return X_i, X_j, biases[self._bias_of] - self._bias_0
 
@@ -172,8 +177,8 @@ def odometry_errors(
     """Whitened errors of n motions, shape (n, 6), from `OdometryStack._states` and `BiasedMotions`."""
     errors = np.empty((len(i_T_j), 6))
     for k in range(len(i_T_j)):
-        e = evaluated(X_i[k], X_j[k], changes[k], i_T_j[k], D[k], h[k])[0]
-        store_vector(mat6(whitening[k]) @ e, errors[k])
+        found = evaluated(X_i[k], X_j[k], changes[k], i_T_j[k], D[k], h[k])
+        store_row6(mat6(whitening[k]) @ found.e, errors, k, 0)
     return errors
 
 
@@ -188,60 +193,79 @@ def odometry_derivatives(
     by_j = np.empty((n, 6, 6))
     by_b = np.empty((n, biases, 6))
     for k in range(n):
-        e, E, turned, c, turn, up = evaluated(X_i[k], X_j[k], changes[k], i_T_j[k], D[k], h[k])
+        found = evaluated(X_i[k], X_j[k], changes[k], i_T_j[k], D[k], h[k])
         W = mat6(whitening[k])
-        J = W @ log_derivative(e.a, E[1])
-        store_vector(W @ e, errors[k])
-        store_columns(J @ inverse_adjoint(turned), -1.0, by_i[k])
-        store_columns(J @ Mat6(I3, O3, O3, turn.T), 1.0, by_j[k])
-        # J(c)^-1 has the blocks V^T, 0, -V^T B, V^T
-        tilt, way = c
-        V_T = exp_and_mean(tilt)[1].T
-        V_T_B = V_T @ log_derivative(tilt, way).c
-        by_c = J @ inverse_adjoint(E)
-        by_psi = J @ Vec6(up, Vec3(0.0, 0.0, 0.0))
+        J = W @ log_derivative(found.e.a, found.E.p)
+        store_row6(W @ found.e, errors, k, 0)
+        store_all((-1.0 * J @ inverse_adjoint(found.turned)).T, by_i[k])  # (2)
+        store_all((J @ Mat6(I3, O3, O3, found.turn.T)).T, by_j[k])  # (3)
+        # (4), a column at a time; J(c)^-1 has the blocks V^T, 0, -V^T B, V^T
+        V_T = exp_and_mean(found.tilt)[1].T
+        V_T_B = V_T @ log_derivative(found.tilt, found.way).c
+        by_c = J @ inverse_adjoint(found.E)
+        by_psi = J @ Vec6(found.up, ZERO)
+        columns = by_b[k]
         for m in range(biases):
             a = V_T @ vec(D[k, :3, m])
             column = by_c @ Vec6(a, V_T @ vec(D[k, 3:, m]) - V_T_B @ a)
             h_m = h[k, m]
-            store_vector(Vec6(-1.0 * column.a - h_m * by_psi.a, -1.0 * column.b - h_m * by_psi.b), by_b[k, m])
+            store_row6(Vec6(-1.0 * column.a - h_m * by_psi.a, -1.0 * column.b - h_m * by_psi.b), columns, m, 0)
     return errors, by_i, by_j, by_b
 
 
+class Transform(NamedTuple):
+    """Rotation and translation."""
+
+    R: Mat3
+    p: Vec3
+
+
+class Evaluated(NamedTuple):
+    """Error of one motion, with the parts of its derivatives."""
+
+    e: Vec6
+    E: Transform
+    turned: Transform
+    """``X_i^-1 X_j Exp(-psi u)``."""
+    tilt: Vec3
+    """Turn of c."""
+    way: Vec3
+    """Translation of ``Exp(c)``."""
+    turn: Mat3
+    """``Exp(-psi u)``."""
+    up: Vec3
+    """u."""
+
+
 @inlined
-def evaluated(
-    X_i: Floats, X_j: Floats, change: Floats, mean: Floats, D: Floats, h: Floats
-) -> tuple[Vec6, tuple[Mat3, Vec3], tuple[Mat3, Vec3], tuple[Vec3, Vec3], Mat3, Vec3]:
-    """e; E; ``X_i^-1 X_j Exp(-psi u)``; c as a turn and the translation of Exp(c); Exp(-psi u) and u."""
+def evaluated(X_i: Floats, X_j: Floats, change: Floats, mean: Floats, D: Floats, h: Floats) -> Evaluated:
+    """Error (1) of one motion."""
     R_i, p_i = pose(X_i)
     R_j, p_j = pose(X_j)
     R_m, p_m = pose(mean)
-    tilt = Vec3(0.0, 0.0, 0.0)
-    chord = Vec3(0.0, 0.0, 0.0)
+    tilt = ZERO
+    chord = ZERO
     psi = 0.0
     for m in range(len(change)):
         tilt = tilt + change[m] * vec(D[:3, m])
         chord = chord + change[m] * vec(D[3:, m])
         psi += h[m] * change[m]
     exp_tilt, V = exp_and_mean(tilt)
-    way = V @ chord
+    way = V @ chord  # Exp(c) = (Exp(tilt), V chord)
     up = R_j.z  # the last row of R_j: the world's vertical in body j
     turn = exp_and_mean(-psi * up)[0]
-    turned_R = R_i.T @ R_j @ turn
-    turned_p = R_i.T @ (p_j - p_i)
-    corrected_R = R_m @ exp_tilt
-    corrected_p = R_m @ way + p_m
-    E_R = corrected_R.T @ turned_R
-    E_p = corrected_R.T @ (turned_p - corrected_p)
-    theta = rotation_log(E_R)
-    e = Vec6(theta, chord_inverse(theta) @ E_p)
-    return e, (E_R, E_p), (turned_R, turned_p), (tilt, way), turn, up
+    turned = Transform(R_i.T @ R_j @ turn, R_i.T @ (p_j - p_i))
+    corrected = Transform(R_m @ exp_tilt, R_m @ way + p_m)  # i_T_j Exp(c)
+    E = Transform(corrected.R.T @ turned.R, corrected.R.T @ (turned.p - corrected.p))
+    theta = rotation_log(E.R)
+    e = Vec6(theta, chord_inverse(theta) @ E.p)  # (5)
+    return Evaluated(e, E, turned, tilt, way, turn, up)
 
 
 @inlined
-def pose(rows: Floats) -> tuple[Mat3, Vec3]:
-    """R and p of the rows of R, and p, shape (12,)."""
-    return Mat3(vec(rows[:3]), vec(rows[3:6]), vec(rows[6:9])), vec(rows[9:])
+def pose(rows: Floats) -> Transform:
+    """Transform from the rows of R, and p, shape (12,)."""
+    return Transform(Mat3(vec(rows[:3]), vec(rows[3:6]), vec(rows[6:9])), vec(rows[9:]))
 
 
 @inlined
@@ -253,32 +277,10 @@ def log_derivative(theta: Vec3, t: Vec3) -> Mat6:
     V_inverse = rodrigues(theta, x, -0.5, a)
     bent = slope * (along * theta - x * t) - 2.0 * a * t
     B = outer(bent, theta) + a * outer(theta, t) + (a * along) * I3 + 0.5 * (I3 @ skew(t))
-    return Mat6(V_inverse.T, O3, B @ V_inverse.T, V_inverse.T)
+    return Mat6(V_inverse.T, O3, B @ V_inverse.T, V_inverse.T)  # (6)
 
 
 @inlined
-def inverse_adjoint(T: tuple[Mat3, Vec3]) -> Mat6:
+def inverse_adjoint(T: Transform) -> Mat6:
     """``Ad(T^-1)``."""
-    R, t = T
-    return Mat6(R.T, O3, -1.0 * (R.T @ skew(t)), R.T)
-
-
-@inlined
-def store_vector(v: Vec6, out: Floats) -> None:
-    """Write a vector into an array."""
-    out[0], out[1], out[2] = v.a
-    out[3], out[4], out[5] = v.b
-
-
-@inlined
-def store_columns(A: Mat6, sign: float, out: Floats) -> None:
-    """Write a matrix into an array, transposed and with a sign."""
-    T = A.T
-    for r, (left, right) in enumerate(((T.a, T.b), (T.c, T.d))):
-        for i, (v, w) in enumerate(((left.x, right.x), (left.y, right.y), (left.z, right.z))):
-            store_vector(Vec6(sign * v, sign * w), out[3 * r + i])
-
-
-def pose_row(pose: gtsam.Pose3) -> Floats:
-    """Rows of R, and p, shape (12,)."""
-    return np.concatenate((pose.rotation().matrix().ravel(), pose.translation()))
+    return Mat6(T.R.T, O3, -1.0 * (T.R.T @ skew(T.p)), T.R.T)

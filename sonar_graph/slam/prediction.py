@@ -1,41 +1,153 @@
-"""Prediction of a sonar frame from the graph: range and azimuth of landmarks, with covariances.
+"""Poses between keyframes, and sonar frames predicted from there: range and azimuth of landmarks, with covariances.
 
-With the motion M from a keyframe X to the frame, its noise covariance Q, its derivative D by the biases b, and the
-sonar mounted at T, the landmark p is expected at ``h(X M T, p)``, h of `sonar_graph.models.sonar`. The covariance of
-the expectation is::
+With the motion M from a keyframe X to an instant, its noise covariance Q and its derivative D by the biases b, the body
+is at ``X M`` then. Since ``X Exp(e_X) M Exp(D e_b) = X M Exp(Ad(M^-1) e_X + D e_b)``, its covariance is::
 
-    S_0 = H P H' + H_M Q H_M',    H = [H_X, H_M D, H_p]
+    J P J' + Q,    J = [Ad(M^-1), D]                                                                           (1)
 
-P is the joint covariance of (X, b, p), H_M the derivative by the body's pose at the frame.
+P is the joint covariance of (X, b). With the sonar mounted at T, a landmark p is expected at ``h(X M T, p)``, h of
+`sonar_graph.models.sonar`, with the covariance::
+
+    S_0 = H P H' + H_M Q H_M',    H = [H_M J, H_p]                                                             (2)
+
+Here P is the joint covariance of (X, b, p), H_M the derivative by the body's pose at the instant.
+
+The tie of an instant to its keyframe is kept while the keyframe may still change. Once it leaves a bounded window, only
+the pose is kept: 232 bytes for each instant.
 """
 
+from array import array
+from bisect import bisect_left
+from dataclasses import dataclass
+from itertools import groupby
 from typing import NamedTuple
 
 import gtsam
 import numpy as np
 
 from sonar_graph.measurements import Floats
-from sonar_graph.models import view_points, wrap_angle
+from sonar_graph.models import polar_difference, view_points
 from sonar_graph.motion import PreintegratedMotion
 from sonar_graph.numerics import cross_matrix
-from sonar_graph.slam.smoother import JointCovariance
+from sonar_graph.slam.smoother import JointCovariance, Known, Marginals
+from sonar_graph.states import Estimate, Trajectory
 
 IDENTITY = np.eye(2)
+TRIANGLE = np.tril_indices(6)
 
 
 class Tie(NamedTuple):
-    """Instant of a frame, tied to a keyframe by odometry."""
+    """Instant that is tied to a keyframe by odometry."""
 
     pose_key: int
     bias_key: int | None
-    """Biases since the keyframe; None when none are estimated."""
+    """Biases since the keyframe; None where the motion does not depend on them."""
     motion: PreintegratedMotion
-    """M, from the keyframe to the frame."""
+    """M, from the keyframe to the instant."""
 
     @property
     def keys(self) -> list[int]:
-        """Variables on which the frame's pose depends."""
+        """Variables on which the pose at the instant depends."""
         return [self.pose_key] if self.bias_key is None else [self.pose_key, self.bias_key]
+
+    def by_state(self, i_T_j: gtsam.Pose3, covariance: JointCovariance) -> Floats:
+        """J of (1), by all variables of a joint covariance, shape (6, N), for the motion as corrected for biases."""
+        J = np.zeros((6, len(covariance.matrix)))
+        row = covariance.rows[self.pose_key]
+        J[:, row : row + 6] = i_T_j.inverse().AdjointMap()
+        if self.bias_key is not None:
+            row = covariance.rows[self.bias_key]
+            J[:, row : row + len(self.motion.bias)] = self.motion.D_bias
+        return J
+
+
+@dataclass(frozen=True, eq=False)
+class AnchoredPose:
+    """Instant of a call of the estimator, tied to the newest keyframe of its time."""
+
+    stamp_ns: int
+    tie: Tie
+
+    def carried_on(self, values: Known, joint: JointCovariance) -> Estimate:
+        """Pose at this instant from the keyframe and the biases, whose errors the motion inherits; (1)."""
+        pose_key, bias_key, motion = self.tie
+        # the biases may have moved since the motion was integrated
+        i_T_j = motion.i_T_j if bias_key is None else motion.corrected(values.atVector(bias_key))
+        J = self.tie.by_state(i_T_j, joint)
+        cov = J @ joint.matrix @ J.T + motion.covariance
+        return Estimate(self.stamp_ns, values.atPose3(pose_key).compose(i_T_j), 0.5 * (cov + cov.T))
+
+
+class PoseHistory:
+    """Instants in the order of time: first those whose pose is final, in columns, then those that may still change."""
+
+    def __init__(self) -> None:
+        self._open: list[AnchoredPose] = []
+        self._stamps_ns = array("q")
+        self._poses = array("d")
+        """Position and quaternion, seven numbers for each instant."""
+        self._triangles = array("d")
+        """Lower triangle of the covariance, 21 numbers for each instant."""
+
+    @property
+    def newest_ns(self) -> int | None:
+        """Last instant; None before the first."""
+        return self._open[-1].stamp_ns if self._open else None
+
+    def add(self, instant: AnchoredPose) -> None:
+        """Append an instant, in place of the last one when the stamp is the same."""
+        if self.newest_ns == instant.stamp_ns:
+            self._open.pop()
+        self._open.append(instant)
+
+    def leave(self, pose_keys: set[int], values: Known, marginals: gtsam.ISAM2) -> None:
+        """Make the poses final whose keyframes leave a bounded window."""
+        count = 0
+        while count < len(self._open) and self._open[count].tie.pose_key in pose_keys:
+            count += 1
+        if count:
+            part = Trajectory.from_estimates(_estimates(self._open[:count], values, marginals))
+            i, j = TRIANGLE
+            self._stamps_ns.extend(part.stamps_ns.tolist())
+            self._poses.extend(np.hstack([part.positions, part.quaternions_xyzw]).ravel().tolist())
+            self._triangles.extend(part.covariances[:, i, j].ravel().tolist())
+        del self._open[:count]
+
+    def forget_before(self, stamp_ns: int) -> None:
+        """Drop older final poses."""
+        count = bisect_left(self._stamps_ns, stamp_ns)
+        del self._stamps_ns[:count]
+        del self._poses[: 7 * count]
+        del self._triangles[: 21 * count]
+
+    def trajectory(self, values: Known, marginals: Marginals) -> Trajectory:
+        """Poses at all instants."""
+        rest = Trajectory.from_estimates(_estimates(self._open, values, marginals))
+        n = len(self._stamps_ns)
+        if n == 0:  # the usual case of a whole history
+            return rest
+        poses = np.array(self._poses).reshape(n, 7)
+        covariances = np.empty((n, 6, 6))
+        i, j = TRIANGLE
+        triangles = np.array(self._triangles).reshape(n, -1)  # (n, 21)
+        covariances[:, i, j] = triangles
+        covariances[:, j, i] = triangles
+        return Trajectory(
+            np.concatenate([np.array(self._stamps_ns), rest.stamps_ns]),
+            np.concatenate([poses[:, :3], rest.positions]),
+            np.concatenate([poses[:, 3:], rest.quaternions_xyzw]),
+            np.concatenate([covariances, rest.covariances]),
+        )
+
+
+def _estimates(instants: list[AnchoredPose], values: Known, marginals: Marginals | gtsam.ISAM2) -> list[Estimate]:
+    estimates = []
+    # instants of one keyframe share its covariance, which is most of the work
+    for _, on_one in groupby(instants, key=lambda instant: instant.tie.pose_key):
+        together = list(on_one)
+        joint = JointCovariance.of(marginals, together[0].tie.keys)
+        estimates += [instant.carried_on(values, joint) for instant in together]
+    return estimates
 
 
 class Compared(NamedTuple):
@@ -80,8 +192,7 @@ class PredictedView:
         self, tie: Tie, world_T_keyframe: gtsam.Pose3, body_T_sonar: gtsam.Pose3, covariance: JointCovariance
     ) -> None:
         motion = tie.motion
-        keyframe_T_sonar = motion.i_T_j.compose(body_T_sonar)
-        self.world_T_sonar = world_T_keyframe.compose(keyframe_T_sonar)
+        self.world_T_sonar = world_T_keyframe.compose(motion.i_T_j.compose(body_T_sonar))
         """Pose of the sonar at the frame."""
         self._world_T_keyframe = world_T_keyframe
         self._covariance = covariance
@@ -89,13 +200,8 @@ class PredictedView:
         self._pose_row = covariance.rows[tie.pose_key]
         self._by_body = body_T_sonar.inverse().AdjointMap()
         """Derivative of the sonar's pose by the body's, both at the frame, shape (6, 6)."""
-        self._by_state = np.zeros((6, len(covariance.matrix)))
-        """Derivative of the sonar's pose by all variables of the covariance; only keyframe and biases count."""
-        self._by_state[:, self._pose_row : self._pose_row + 6] = keyframe_T_sonar.inverse().AdjointMap()
-        if tie.bias_key is not None:
-            row = covariance.rows[tie.bias_key]
-            # the biases bend the motion, whose perturbation is that of the body at the frame
-            self._by_state[:, row : row + len(motion.bias)] = self._by_body @ motion.D_bias
+        self._by_state = self._by_body @ tie.by_state(motion.i_T_j, covariance)
+        """Derivative of the sonar's pose by all variables of the covariance, shape (6, N)."""
 
     def height_variances(self, points: Floats) -> Floats:
         """Variance of the world z of points fixed to the body at the frame, shape (m,), m².
@@ -149,7 +255,7 @@ class PredictedView:
             H[k, :, rows[source.pose_key] : rows[source.pose_key] + 6] += by_point[k] @ source.by_pose
         H = H.reshape(2 * n, len(P))
         H_M = (by_sonar @ self._by_body).reshape(2 * n, 6)
-        joint = H @ P @ H.T + H_M @ Q @ H_M.T
+        joint = H @ P @ H.T + H_M @ Q @ H_M.T  # (2)
         for k, source in enumerate(sources, start=len(keys)):
             # own noise of the point, independent of all variables of the graph
             joint[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += by_point[k] @ source.cov @ by_point[k].T
@@ -172,8 +278,7 @@ class PredictedView:
 
 def weigh(z: Floats, expected: Floats, prior_cov: Floats, cov: Floats) -> Compared:
     """Compare m detections and their noise with the expectation and its covariance."""
-    innovation = z - expected
-    innovation[:, 1] = wrap_angle(innovation[:, 1])
+    innovation = polar_difference(z, expected)
     S = prior_cov + cov
     r, alpha = innovation.T
     a, b, _, c = S.reshape(-1, 4).T

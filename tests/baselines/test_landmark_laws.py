@@ -13,8 +13,9 @@ from baselines.filter import lockout_messages
 from baselines.kalman import GATED, USED, far_covariance, is_far, judged, judged_far
 from sonar_graph.calibration import FloorPrior, SonarCalibration
 from sonar_graph.measurements import NS_PER_S
-from sonar_graph.models import FLOOR_GATE, RobustKernel, elevation_on_floor, gate_threshold, locate, range_azimuth
+from sonar_graph.models import FLOOR_GATE, RobustKernel, elevation_on_floor, locate, range_azimuth
 from sonar_graph.navigation import Odometry
+from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 from sonar_graph.states import DetectionLog, Outcome
@@ -149,7 +150,7 @@ def test_a_floor_outside_the_aperture_counts_up_to_its_gate(filter_, side, share
 
 
 def test_the_floor_s_gate_is_passed_by_999_of_1000_that_stand_on_it():
-    assert pytest.approx(gate_threshold(0.999, 1), abs=5e-3) == FLOOR_GATE
+    assert pytest.approx(chi_square_quantile(0.999, 1), abs=5e-3) == FLOOR_GATE
 
 
 @both
@@ -236,7 +237,7 @@ def test_what_no_vehicle_in_reach_sees_is_refused(filter_):
     outcome, at, _, e, S = look(filter_, np.array([40.0, 20.0, -0.5]), 30.0, True, wrong_m=300.0)
     assert outcome == GATED
     assert_allclose(at, 0.0, atol=1e-15)
-    assert e @ np.linalg.solve(S, e) > gate_threshold(0.999, 2)
+    assert e @ np.linalg.solve(S, e) > chi_square_quantile(0.999, 2)
 
 
 def far(cov, G_z, range_m, noise):
@@ -291,7 +292,7 @@ def test_what_is_linear_is_the_same_wherever_the_sonar_points(range_m):
 @pytest.mark.parametrize("direction", [(2.0, 1.0), (2.0, -1.0), (1.0, 0.0)])
 def test_the_gate_is_an_ellipse_of_a_correlated_innovation(direction):
     """Range and azimuth correlated by 0.9: along the long axis far more passes than across it."""
-    S, threshold = np.array([[4.0, 1.8], [1.8, 1.0]]), gate_threshold(0.999, 2)
+    S, threshold = np.array([[4.0, 1.8], [1.8, 1.0]]), chi_square_quantile(0.999, 2)
     e = np.array(direction) * np.sqrt(threshold / (direction @ np.linalg.solve(S, direction)))
     assert admitted(0.999 * e, S, gate_probability=0.999)[0] == USED
     assert admitted(1.001 * e, S, gate_probability=0.999)[0] == GATED

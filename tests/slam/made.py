@@ -15,7 +15,7 @@ from sonar_graph.navigation import Odometry, PreintegratedMotion
 from sonar_graph.sequence import Sequence
 from sonar_graph.settings import nested
 from sonar_graph.slam import Isam2, Isam2Params
-from sonar_graph.slam.estimates import PoseHistory
+from sonar_graph.slam.prediction import PoseHistory
 from sonar_graph.slam.smoother import BoundedHistory, Smoother, SmootherParams, WholeHistory
 from sonar_graph.states import Estimate
 

@@ -12,7 +12,7 @@ from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 from sonar_graph.slam import Isam2
-from sonar_graph.slam.estimates import AnchoredPose
+from sonar_graph.slam.prediction import AnchoredPose, Tie
 from sonar_graph.slam.smoother import JointCovariance
 from sonar_graph.states import FIRST_ANONYMOUS_ID, Outcome
 from sonar_graph.testing.numerical import central_differences
@@ -31,7 +31,7 @@ def test_the_pose_and_its_covariance_are_those_of_keyframe_bias_and_motion(bias_
     """``J P J'`` with J by differences, P joint of keyframe and bias: what both share counts."""
     moved, P = some_motion(1, 5e-3), random_covariance(17, 0.01, 3)
     joint = JointCovariance(P, {B(0): 6, X(3): 0})
-    found = AnchoredPose(7, 3, bias_key, moved).carried_on(values_of(X3=KEYFRAME, B0=BIAS), joint)
+    found = AnchoredPose(7, Tie(X(3), bias_key, moved)).carried_on(values_of(X3=KEYFRAME, B0=BIAS), joint)
 
     def carried(state: Floats) -> gtsam.Pose3:
         pose = KEYFRAME.compose(gtsam.Pose3.Expmap(state[:6]))

@@ -75,7 +75,7 @@ def sightings(pose: gtsam.Pose3, rng: np.random.Generator) -> Made:
     for off in (np.pi - 0.01, 0.01 - np.pi):  # behind the sonar, where the azimuth's error jumps
         behind = values_of(X0=pose, L0=seen_from(pose, azimuth + off, elevation, 2.1))
         z = np.array([2.0, azimuth])
-        yield factors.correlated_sighting(X(0), L(0), BODY_T_SONAR, z, correlated(0.5), plain), behind
+        yield factors.CorrelatedSighting(X(0), L(0), BODY_T_SONAR, z, plain(factors.gaussian(correlated(0.5)))), behind
 
 
 def attitudes_and_heights(pose: gtsam.Pose3, rng: np.random.Generator) -> Made:
@@ -193,7 +193,7 @@ def test_an_azimuth_is_an_angle_however_wrong_it_is(azimuth, off):
     values = values_of(X0=pose, L0=seen_from(pose, azimuth, 0.0, 2.0))
     z, cov = np.array([2.0, azimuth - off]), np.diag([4e-4, 8e-5])
     camera = factors.landmark_sighting(X(0), L(0), BODY_T_SONAR, z, cov, plain)["azimuth"]
-    model = factors.correlated_sighting(X(0), L(0), BODY_T_SONAR, z, cov, plain)
+    model = factors.CorrelatedSighting(X(0), L(0), BODY_T_SONAR, z, plain(factors.gaussian(cov)))
     assert camera.unwhitenedError(values)[0] == pytest.approx(model.unwhitenedError(values)[1], abs=1e-7)
 
 
@@ -203,7 +203,7 @@ def test_a_correlated_sighting_is_the_model_weighed_by_its_covariance(azimuth, e
     pose, off, cov = POSES["random"], np.array([0.03, -0.01]), correlated(correlation)
     z = np.array([2.0, azimuth]) - off
     values = values_of(X0=pose, L0=seen_from(pose, azimuth, elevation, 2.0))
-    sighting = factors.correlated_sighting(X(0), L(0), BODY_T_SONAR, z, cov, plain)
+    sighting = factors.CorrelatedSighting(X(0), L(0), BODY_T_SONAR, z, plain(factors.gaussian(cov)))
     assert np.allclose(sighting.unwhitenedError(values), off, atol=1e-9)
     assert sighting.error(values) == pytest.approx(0.5 * off @ np.linalg.solve(cov, off), rel=1e-6)
 
@@ -364,7 +364,7 @@ def test_correlated_sightings_together_are_what_each_is():
         body_T_sonar, half = gtsam.Pose3.Expmap(rng.standard_normal(6)), 0.1 * rng.standard_normal((2, 2))
         z, cov = rng.uniform((1.0, -3.0), (5.0, 3.0)), half @ half.T + 1e-3 * np.eye(2)
         keys = X(int(rng.integers(5))), L(int(rng.integers(5)))
-        made.append(factors.correlated_sighting(*keys, body_T_sonar, z, cov, kernels[k % 3]))
+        made.append(factors.CorrelatedSighting(*keys, body_T_sonar, z, kernels[k % 3](factors.gaussian(cov))))
     stack = SightingStack(made)
     assert stack.error(values) == pytest.approx(sum(factor.error(values) for factor in made), rel=1e-12)
     for found, factor in zip(stack.linear_factors(values), made, strict=True):

@@ -8,7 +8,9 @@ mixture_policy.py       policy "max-mixture", with the log densities and votes o
 """
 
 # fmt: off
-from sonar_graph.slam.landmarks.landmark_graph import AmendableJournal, Decision, IdentityPolicy, LandmarkGraph
+from sonar_graph.slam.landmarks.landmark_graph import (
+    AmendableJournal, Decision, IdentityPolicy, LandmarkGraph, Solution,
+)
 from sonar_graph.slam.landmarks.mixture_policy import IdentityParams, MixtureIdentities, MixtureIdentity
 from sonar_graph.slam.landmarks.sighting import Frame, SeenFrame, SightingFactors
 from sonar_graph.slam.landmarks.tracked import GatedIdentity, RobustIdentity, TrackedIdentities
@@ -17,5 +19,5 @@ from sonar_graph.slam.landmarks.unknown import AssociatedUnknown, NamelessLandma
 __all__ = [
     "AmendableJournal", "AssociatedUnknown", "Decision", "Frame", "GatedIdentity", "IdentityParams", "IdentityPolicy",
     "LandmarkGraph", "MixtureIdentities", "MixtureIdentity", "NamelessLandmarks", "RobustIdentity", "SeenFrame",
-    "SightingFactors", "TrackedIdentities", "unnamed",
+    "SightingFactors", "Solution", "TrackedIdentities", "unnamed",
 ]

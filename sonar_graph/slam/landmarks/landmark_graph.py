@@ -28,9 +28,8 @@ import gtsam
 from gtsam.symbol_shorthand import L
 
 from sonar_graph.measurements import Floats, LandmarkDetections
-from sonar_graph.slam.estimates import Solution
 from sonar_graph.slam.landmarks.sighting import Frame, SeenFrame, Sighting, SightingFactors
-from sonar_graph.slam.smoother import Changed, FactorGroup, Smoother
+from sonar_graph.slam.smoother import Changed, FactorGroup, Known, Marginals, Smoother
 from sonar_graph.states import OUTCOME_NUMBERS, UNKNOWN, DetectionJournal, DetectionLog, Outcome
 
 IN_GRAPH = frozenset(
@@ -97,6 +96,15 @@ class Decision:
 
 
 UNCHANGED = Decision()
+
+
+class Solution(NamedTuple):
+    """Solution of the whole graph."""
+
+    values: Known
+    marginals: Marginals
+    ids: list[int]
+    """Landmarks in it, ascending."""
 
 
 class IdentityPolicy:
@@ -180,7 +188,6 @@ class AmendableJournal(DetectionJournal):
         self._outcomes[row] = OUTCOME_NUMBERS[changed.outcome]
         if changed.landmark_id is not None:
             self._ids[row] = changed.landmark_id
-        # an innovation was against the landmark of the earlier outcome
         e = UNKNOWN[:2] if changed.innovation is None else changed.innovation.tolist()
         S = UNKNOWN if changed.S is None else changed.S.ravel().tolist()
         self._innovations[2 * row : 2 * row + 2] = array("d", e)
@@ -261,6 +268,7 @@ class LandmarkGraph:
         associated: list[tuple[Sighting, int]] = []
         for each in assignments:
             state = self.state(each.sighting)
+            # a policy that breaks the table would leave factors in the graph that no state names
             if each.outcome not in LATER.get(state.outcome, ()):
                 raise AssertionError(f"a sighting that is {state.outcome!r} cannot become {each.outcome!r}")
             self.journal.amend(each)
@@ -274,6 +282,7 @@ class LandmarkGraph:
             self._states[each.sighting] = state._replace(outcome=each.outcome)
             if each.outcome not in LATER:
                 del self._states[each.sighting]
+        # before an exchange, which enters what waits
         for each in added:
             self._add(each)
         if retracted or associated:
@@ -283,7 +292,7 @@ class LandmarkGraph:
         """Outcomes of all detections, with other assignments for some; nothing else changes."""
         if not rechosen:
             return self.journal.log()
-        journal = deepcopy(self.journal)
+        journal = deepcopy(self.journal)  # the run goes on with its own
         for each in rechosen:
             journal.amend(each)
         return journal.log()
@@ -329,6 +338,7 @@ class LandmarkGraph:
 
         A landmark begins with its first sighting and leaves the graph with its last.
         """
+        # only factors that have entered the smoother can be taken out
         self.follow(self.smoother.flush(time_s))
         old_of: dict[Sighting, int] = {}
         for sighting in retracted:
@@ -371,7 +381,7 @@ class LandmarkGraph:
 
     def _first(self, landmark_id: int) -> Sighting | None:
         """Sighting that has the factors that a landmark has once."""
-        if landmark_id in self._rooted:
+        if landmark_id in self._rooted:  # its factors are final
             return self._rooted[landmark_id]
         return min(self._of.get(landmark_id, {}), key=lambda s: (s.stamp_ns, s.row), default=None)
 

@@ -36,7 +36,7 @@ from pydantic import Field
 
 from sonar_graph.calibration import Section
 from sonar_graph.measurements import Floats, LandmarkDetections
-from sonar_graph.models import Kernel, project_points, wrap_angle
+from sonar_graph.models import Kernel, polar_difference, project_points
 from sonar_graph.slam.landmarks.sighting import Sighting
 from sonar_graph.slam.smoother import Known
 
@@ -139,8 +139,7 @@ class Errors:
         from_sonar = points[None] - self._world_p_sonar[:, None]
         q = np.einsum("nji,nkj->nki", self._world_R_sonar, from_sonar)  # R^T (p - t), in sonar axes
         expected, _ = project_points(q.reshape(-1, 3))
-        e = expected.reshape(*q.shape[:2], 2) - self._z[:, None]
-        e[..., 1] = wrap_angle(e[..., 1])
+        e = polar_difference(expected.reshape(*q.shape[:2], 2), self._z[:, None])  # (n, K, 2)
         return np.einsum("nij,nkj->nki", self._whitener, e)
 
 
@@ -154,8 +153,7 @@ class Mixture:
 
     def at_first(self, posterior: IdentityPosterior, ids: list[int], z: Floats, expected: Floats, S: Floats) -> Scores:
         """Components of a detection that the state is not yet conditioned on, with its innovation covariances S."""
-        e = z - expected
-        e[:, 1] = wrap_angle(e[:, 1])
+        e = polar_difference(z, expected)  # (K, 2)
         whitener = np.linalg.inv(np.linalg.cholesky(S))
         losses = self._kernel.loss(np.einsum("kij,kj->ki", whitener, e)).sum(axis=1)
         half_log_det = 0.5 * np.linalg.slogdet(S)[1]

@@ -19,15 +19,16 @@ import numpy as np
 from gtsam.symbol_shorthand import L
 from pydantic import Field
 
+from sonar_graph.calibration import tagged
 from sonar_graph.measurements import NO_TRACK, NS_PER_S, LandmarkDetections
 from sonar_graph.models import Kernel, locate
-from sonar_graph.slam.estimates import Solution
 from sonar_graph.slam.landmarks.landmark_graph import (
     UNCHANGED,
     Assignment,
     Decision,
     IdentityPolicy,
     LandmarkGraph,
+    Solution,
 )
 from sonar_graph.slam.landmarks.mixture import (
     Choices,
@@ -43,7 +44,6 @@ from sonar_graph.slam.landmarks.sighting import Frame, SeenFrame, Sighting, late
 from sonar_graph.slam.landmarks.tracked import GatedIdentity, RobustIdentity, second_rows_of_tracks
 from sonar_graph.slam.smoother import Marginals, Sightline, solve_in_sight
 from sonar_graph.states import Outcome
-from sonar_graph.tagged_sections import tagged
 
 MOST_WINDOW_ROUNDS = 3
 """Times that the choices of the window are revised after one frame."""
@@ -125,6 +125,7 @@ class MixtureIdentities(IdentityPolicy):
         if len(ids) > MOST_RIVALS:
             seen = np.array([locate(world_T_sonar, r, a, 0.0)[:2] for r, a in frame.z.tolist()])
             points = np.array([self.smoother.estimates.atPoint3(L(i))[:2] for i in ids])
+            # horizontal: the elevation of a detection is not known
             distance_m = np.linalg.norm(points - seen[:, None], axis=2)  # (m, K)
             nearest = np.argpartition(distance_m, MOST_RIVALS - 1, axis=1)[:, :MOST_RIVALS]
             kept: set[int | None] = {ids[k] for k in np.unique(nearest).tolist()}
@@ -160,6 +161,7 @@ class MixtureIdentities(IdentityPolicy):
         for row, sighting in enumerate(seen.sightings(rows, seen.beam_points(rows))):
             each = self._tracked(tracks[row], posteriors[row])
             judged += self._extended(each, sighting, chosen[row])
+        # the recogniser may use the number of a track that is over for another object
         self._oldest_ns = frame.stamp_ns - self._longest_wait_ns
         self._tracks = {k: each for k, each in self._tracks.items() if each.sightings[-1].stamp_ns >= self._oldest_ns}
         self._round = 0
@@ -177,6 +179,7 @@ class MixtureIdentities(IdentityPolicy):
 
     def reconsider(self) -> Decision:
         """Revise the choices of the window until none changes; then move landmarks to where their sightings agree."""
+        # places last: a landmark moves only when no choice changes any more
         revised = self._revise_window()
         return self._relocate() if revised.is_empty else revised
 
@@ -244,7 +247,7 @@ class MixtureIdentities(IdentityPolicy):
     def _revise_window(self) -> Decision:
         """Next choices in the window; empty when none changes, and after `MOST_WINDOW_ROUNDS`."""
         self._round += 1
-        if self._round == 1:
+        if self._round == 1:  # the window is read once a frame; later rounds revise the same objects
             self._open = self._revisable()
         if self._round > 1 + MOST_WINDOW_ROUNDS:
             self._open = []
@@ -261,7 +264,7 @@ class MixtureIdentities(IdentityPolicy):
     def _relocate(self) -> Decision:
         """Begin the next disputed landmark again where the objects that name it agree that it is."""
         while self._disputed:
-            landmark_id = min(self._disputed)
+            landmark_id = min(self._disputed)  # the order must not depend on how the set was filled
             self._disputed.discard(landmark_id)
             if landmark_id not in self.landmarks:
                 continue
@@ -324,12 +327,14 @@ class MixtureIdentities(IdentityPolicy):
     def history(self) -> ChosenHistory:
         """Revise the choices of the whole history until none changes. The run's own choices stay."""
         solved, marginals = self.smoother.solve_history()
+        # the solution of an unchanged graph is the same object; sightings of no landmark do not change it
         count = sum(len(each.sightings) for each in self.objects)
         if self._chosen is None or self._chosen[0] is not solved or self._chosen[1] != count:
             self._chosen = (solved, count, self._choose_history(solved, marginals))
         return self._chosen[2]
 
     def _choose_history(self, solved: gtsam.Values, marginals: Marginals) -> ChosenHistory:
+        # what left a variable undetermined in the run would do so here
         objects = [each for each in self.objects if not self._is_withheld(each)]
         handles = {self.landmarks.state(sighting).handle for each in objects for sighting in each.sightings}
         rest = self.smoother.graph_without({handle for handle in handles if handle is not None})
@@ -345,7 +350,7 @@ class MixtureIdentities(IdentityPolicy):
                 break
             values = self.solution(rest, objects, start, better)
             choices = better
-        if values is not solved:
+        if values is not solved:  # else those of the run's own graph hold
             marginals = Marginals(self.graph(rest, objects, choices), values)
         return ChosenHistory(values, marginals, objects, choices)
 
@@ -384,6 +389,7 @@ class MixtureIdentities(IdentityPolicy):
             if choice is None:
                 continue
             lines[L(choice)] += [sighting.line for sighting in each.sightings]
+            # a landmark that the run does not have begins where its first object has it
             if not start.exists(L(choice)):
                 start.insert(L(choice), self.landmarks.factors.start(each.sightings[0], values))
         return solve_in_sight(self.graph(rest, objects, choices), start, lines)

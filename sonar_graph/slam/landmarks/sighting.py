@@ -61,6 +61,7 @@ class SightingFactors:
         """Range and azimuth; for the first sighting of a landmark also its direction, and its elevation or floor."""
         line = sighting.line
         elevation = self.elevation_sigma_rad if is_first and sighting.floor is None else None
+        # once for each landmark, and only where no floor gives the height
         made: Factors = {
             **factors.landmark_sighting(
                 line.pose_key, key, line.body_T_sonar, line.z, sighting.noise, self._robust, elevation
@@ -187,6 +188,7 @@ class SeenFrame:
         slope_m = self.frame.z[rows, 0] * self.view.world_T_sonar.rotation().matrix()[2, 2]
         by_elevation = np.square(slope_m * self.factors.elevation_sigma_rad)
         variance = by_elevation + self.view.height_variances(points) + floor.sigma_m**2
+        # an object on a wall or a wreck must not be pulled to the floor
         is_on_floor = np.square(points[:, 2] - floor.z_m) <= FLOOR_GATE * variance
         return [floor if is_on else None for is_on in is_on_floor.tolist()]
 

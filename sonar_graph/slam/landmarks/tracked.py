@@ -21,7 +21,8 @@ from pydantic import Field
 
 from sonar_graph.calibration import Section
 from sonar_graph.measurements import NO_TRACK, NS_PER_S, LandmarkDetections
-from sonar_graph.models import ACCEPTED, MINIMUM_PROBABILITY, gate_threshold, identify, locate
+from sonar_graph.models import ACCEPTED, MINIMUM_PROBABILITY, identify, locate
+from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.slam.landmarks.landmark_graph import (
     UNCHANGED,
     Assignment,
@@ -93,7 +94,7 @@ class GatedIdentity(TrackedIdentity):
     @property
     def gate(self) -> float:
         """Largest squared Mahalanobis distance of range and azimuth; infinite: no gate."""
-        return gate_threshold(self.gate_probability, 2) if self.gate_probability < 1 else math.inf
+        return chi_square_quantile(self.gate_probability, 2) if self.gate_probability < 1 else math.inf
 
 
 @dataclass(eq=False)
@@ -210,7 +211,7 @@ class TrackedIdentities(IdentityPolicy):
         track_of = dict(zip(frame.rows, frame.detections.track.tolist(), strict=True))
         for each in judged:
             track = self._tracks.get(track_of[each.sighting.row])
-            if track is None:  # of no track: final
+            if track is None:  # a single detection: final
                 continue
             if each.outcome is Outcome.WAITING:
                 track.waiting.append(each.sighting)
@@ -252,6 +253,7 @@ class TrackedIdentities(IdentityPolicy):
         decisions = decide(frame.detections, self._minimum_probability)
         probability = frame.detections.most_probable()[1]
         decided = []
+        # the order in which tracks may claim a landmark
         for row in np.argsort(-probability, kind="stable").tolist():
             track = self._tracks.setdefault(int(frame.detections.track[row]), Track())
             track.newest_ns = frame.stamp_ns
@@ -293,6 +295,7 @@ class TrackedIdentities(IdentityPolicy):
         values = self.smoother.estimates
         if not sightings or math.isinf(self._gate) or not values.exists(key):
             return [True] * len(sightings)
+        # one joint covariance for all: its cost is that of the keyframes, not of the sightings
         joint = self.smoother.joint_covariance_of_any([key, *{s.line.pose_key for s in sightings}])
         point = values.atPoint3(key)[None]
         flags = []

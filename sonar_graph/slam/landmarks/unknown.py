@@ -28,10 +28,11 @@ from gtsam.symbol_shorthand import L
 from numpy.typing import NDArray
 from pydantic import Field
 
-from sonar_graph.calibration import Section
+from sonar_graph.calibration import Section, tagged
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats, LandmarkDetections
-from sonar_graph.models import gate_threshold, locate_jacobians, range_azimuth_jacobians, wrap_angle
+from sonar_graph.models import locate_jacobians, polar_difference, range_azimuth_jacobians
+from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.slam.keyframes import Keyframes
 from sonar_graph.slam.landmarks.landmark_graph import (
     UNCHANGED,
@@ -44,7 +45,6 @@ from sonar_graph.slam.landmarks.sighting import Frame, SeenFrame, Sighting, Sigh
 from sonar_graph.slam.prediction import PredictedView, Source
 from sonar_graph.slam.smoother import JointCovariance, Known
 from sonar_graph.states import FIRST_ANONYMOUS_ID, Outcome
-from sonar_graph.tagged_sections import tagged
 
 UNPAIRED = -1
 
@@ -120,7 +120,7 @@ class _Search:
     def __init__(self, innovations: Innovations, probability: float) -> None:
         count = len(innovations.innovation)
         self._innovations = innovations
-        self._gates = [0.0] + [gate_threshold(probability, 2 * (k + 1)) for k in range(count)]
+        self._gates = [0.0] + [chi_square_quantile(probability, 2 * (k + 1)) for k in range(count)]
         # a pair that is incompatible alone stays so in every pairing
         self._possible = [
             [j for j in np.argsort(row).tolist() if row[j] <= self._gates[1]] for row in innovations.distances()
@@ -379,13 +379,14 @@ class NamelessLandmarks(IdentityPolicy):
         expected, P = view.expect_jointly(keys, points, sources)
         n = len(ids)
         # landmarks first; a candidate takes only what no landmark explains
-        innovations = _innovations(z, noise, expected[:n], P[: 2 * n, : 2 * n])
+        e = polar_difference(z[:, None], expected[None])  # (m, n + s, 2)
+        innovations = Innovations(e[:, :n], P[: 2 * n, : 2 * n], noise)
         of_landmarks = self._choose(innovations, z)
         for i, j in of_landmarks.items():
             S = innovations.expected_cov[2 * j : 2 * j + 2, 2 * j : 2 * j + 2] + noise[i]
             paired[i] = PairedDetection(ids[j], None, innovations.innovation[i, j], S)
         left = [i for i in range(len(z)) if i not in of_landmarks]
-        innovations = _innovations(z[left], noise[left], expected[n:], P[2 * n :, 2 * n :])
+        innovations = Innovations(e[left, n:], P[2 * n :, 2 * n :], noise[left])
         for i, j in self._choose(innovations, z[left]).items():
             paired[left[i]] = PairedDetection(None, self._candidates[j])
         return paired
@@ -398,13 +399,6 @@ class NamelessLandmarks(IdentityPolicy):
         # a density per area is r times that per range and azimuth
         likely = drop_unlikely(innovations, compatible, self._params.log_rival + np.log(z[:, 0]))
         return {i: j for i, j in enumerate(likely.landmarks) if j != UNPAIRED}
-
-
-def _innovations(z: Floats, noise: Floats, expected: Floats, expected_cov: Floats) -> Innovations:
-    """Innovations of m detections against n expectations, shapes (m, 2) and (n, 2)."""
-    e = z[:, None] - expected[None]
-    e[..., 1] = wrap_angle(e[..., 1])
-    return Innovations(e, expected_cov, noise)
 
 
 def nearest_duplicates(
@@ -430,11 +424,11 @@ def nearest_duplicates(
         return np.asarray(covariance.matrix[i[:, :, None], j[:, None, :]])  # (k, 3, 3)
 
     S = P(of_a, of_a) + P(of_b, of_b) - P(of_a, of_b) - P(of_b, of_a) + sigma2[:, None, None] * np.eye(3)
-    distance = np.einsum("ki,ki->k", d, np.linalg.solve(S, d[..., None])[..., 0])
+    distance = np.einsum("ki,ki->k", d, np.linalg.solve(S, d[..., None])[..., 0])  # d' S^-1 d
     for k in np.argsort(distance).tolist():
         stays, goes = pairs[k]
-        if distance[k] > gate_threshold(params.gate_probability, 3):
-            return None
+        if distance[k] > chi_square_quantile(params.gate_probability, 3):
+            return None  # nor is any later pair compatible
         is_dense = log_density(d[k, :2], S[k, :2, :2]) > params.log_rival
         in_one_frame = landmarks.stamps_ns(stays) & landmarks.stamps_ns(goes)
         if is_dense and not in_one_frame and not landmarks.is_rooted(goes):
@@ -481,8 +475,6 @@ def place(sightings: list[Sighting], values: Known, factors: SightingFactors) ->
         line = sighting.line
         predicted, _, H = range_azimuth_jacobians(values.atPose3(line.pose_key), line.body_T_sonar, point)
         K = np.linalg.solve(H @ P @ H.T + sighting.noise, H @ P).T  # (3, 2)
-        innovation = line.z - predicted
-        innovation[1] = wrap_angle(innovation[1])
-        point = point + K @ innovation
+        point = point + K @ polar_difference(line.z, predicted)
         P = P - K @ H @ P
     return point, P

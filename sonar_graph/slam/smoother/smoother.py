@@ -17,7 +17,7 @@ import gtsam
 import numpy as np
 from pydantic import Field
 
-from sonar_graph.calibration import Section
+from sonar_graph.calibration import Section, tagged
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats
 from sonar_graph.slam.smoother.batch_solution import (
@@ -37,7 +37,6 @@ from sonar_graph.slam.smoother.factor_store import (
 )
 from sonar_graph.slam.smoother.observability import Blame, Withheld
 from sonar_graph.slam.smoother.window import FixedLagWindow, Thresholds, WholeWindow
-from sonar_graph.tagged_sections import tagged
 
 MOST_MESSAGES = 1000
 """Messages about withheld factors that are kept."""
