@@ -456,7 +456,13 @@ class Smoother:
         store = self._store
         try:
             if isinstance(window, WholeWindow):
-                window.update(store.new, self.estimates.new, removed=self._removed, relinearises=relinearises)
+                window.update(
+                    store.new,
+                    self.estimates.new,
+                    removed=self._removed,
+                    relinearises=relinearises,
+                    last=self._asked_next(),
+                )
             else:
                 self._take_leave(time_s - lag_s)
                 times_s = self._used_at(time_s)
@@ -618,18 +624,30 @@ class Smoother:
 
     def joint_covariance(self, keys: list[int]) -> JointCovariance:
         """Joint marginal covariance of variables in the window, and possibly of more of them."""
-        return self._kept_covariance.of(self.marginals, keys, self._landmarks_in_reach)
+        return self._kept_covariance.of(self.marginals, keys, self._likely)
+
+    def _likely(self) -> list[int]:
+        """Landmarks in the window that the next frame may show."""
+        return [key for key in self._landmarks_in_reach() if self.estimates.is_taken_up(key)]
+
+    def _asked_next(self) -> list[int]:
+        """Variables whose covariance will be asked for: newest keyframe and biases, and landmarks in reach."""
+        newest = [key for key in (self._newest_pose, self._newest_bias) if key is not None]
+        return self.in_window(newest) + self._landmarks_in_reach()
 
     def _landmarks_in_reach(self) -> list[int]:
         """Landmarks within `REACH` times the longest range measured so far from the newest keyframe."""
         if self._newest_pose is None or not self._landmarks:
             return []
-        known = [key for key in self._landmarks if self.estimates.is_taken_up(key)]
         reach_m = REACH * self._longest_range_m
+        new = self.estimates.new
+        linearised_at = self._window.linearised_at  # near enough to the estimate, and at hand
         position_m = self.estimates.atPose3(self._newest_pose).translation()
-        points_m = np.array([self.estimates.atPoint3(key) for key in known]).reshape(-1, 3)
-        distances_m = np.linalg.norm(points_m - position_m, axis=1)
-        return [key for key, distance_m in zip(known, distances_m, strict=True) if distance_m <= reach_m]
+        points_m = [(new if new.exists(key) else linearised_at).atPoint3(key) for key in self._landmarks]
+        distances_m = np.linalg.norm(np.array(points_m) - position_m, axis=1)
+        return [
+            key for key, distance_m in zip(self._landmarks, distances_m.tolist(), strict=True) if distance_m <= reach_m
+        ]
 
     def joint_covariance_of_any(self, keys: list[int]) -> JointCovariance:
         """Joint marginal covariance of any variables, from the batch solution if one has left the window."""

@@ -17,6 +17,8 @@ from sonar_graph.slam.smoother.factor_store import BIAS, LANDMARK, TANGENT_SIZES
 
 NEVER = 1_000_000_000
 """Updates between two relinearisations that iSAM2 would begin by itself."""
+LAST = 1
+"""Group of the variables that are eliminated last; all others are in group 0."""
 Times = Mapping[Any, float]
 """Time (s) at which a variable was last used, by key."""
 
@@ -49,6 +51,8 @@ class WholeWindow:
     def __init__(self, thresholds: Thresholds, *, is_by_qr: bool = False) -> None:
         params = isam2_params(thresholds, is_by_qr=is_by_qr)
         params.relinearizeSkip = NEVER
+        # each update orders only the variables that it eliminates: over a long run the tree fills up
+        params.enableAdaptiveReorder = True
         self.isam = gtsam.ISAM2(params)
         self.linearised_at = self.isam.getLinearizationPoint()
         """Linearisation point of every variable.
@@ -68,13 +72,31 @@ class WholeWindow:
         *,
         removed: Iterable[int],
         relinearises: bool,
+        last: Iterable[int] = (),
     ) -> None:
         """Add groups of factors by their handles, with new variables, and remove others.
 
-        ``relinearises``: move the linearisation point of each variable whose change exceeds the threshold.
+        Parameters
+        ----------
+        relinearises
+            True: move the linearisation point of each variable whose change exceeds the threshold.
+        last
+            Variables to eliminate last. They form the root of the Bayes tree. A covariance is computed along the path
+            from the root to its variables, which has one clique then instead of up to fifty.
         """
-        slots = [slot for handle in removed for slot in self._slots.pop(handle)]
-        result = self.isam.update(graph_of(new.values()), values, slots, None, None, None, relinearises)
+        params = gtsam.ISAM2UpdateParams()
+        params.removeFactorIndices = [slot for handle in removed for slot in self._slots.pop(handle)]
+        params.force_relinearize = relinearises
+        groups = gtsam.KeyGroupMap()
+        eliminated_again = gtsam.KeyList()
+        for key in last:
+            groups.insert2(key, LAST)
+            if not values.exists(key):
+                # GTSAM orders only what it eliminates
+                eliminated_again.push_back(key)
+        params.constrainedKeys = groups
+        params.extraReelimKeys = eliminated_again
+        result = self.isam.update(graph_of(new.values()), values, params)
         indices = iter(result.getNewFactorsIndices())
         for handle, group in new.items():
             self._slots[handle] = [next(indices) for _ in group]
@@ -87,8 +109,7 @@ class WholeWindow:
         """Largest component by which some variables have moved from their linearisation point, rad or m."""
         if not keys:
             return 0.0
-        step = picked(self.linearised_at, keys).localCoordinates(self.estimate(keys))  # getDelta() solves for all
-        return float(np.abs(step.vector(keys)).max())
+        return float(np.abs(self.isam.getDelta().vector(keys)).max())
 
     def estimate(self, keys: Sequence[int] | None = None) -> gtsam.Values:
         """Estimate of some variables, or of all."""
