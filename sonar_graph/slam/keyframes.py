@@ -283,12 +283,13 @@ class Keyframes:
             self._start(start_ns)
             changes.append(self._updated())
         interval_ns = round(self.params.max_interval_s * NS_PER_S)
-        while True:
+        while until_ns >= self.stamps_ns[-1] + interval_ns:
             due_ns = self.odometry.epochs(self.stamps_ns[-1] + interval_ns - 1, until_ns)
             if not len(due_ns):
-                return changes
+                break
             self._set(int(due_ns[0]), until_ns)
             changes.append(self._updated())
+        return changes
 
     def _updated(self) -> Changed:
         changed = self.smoother.update(self.newest_s)
