@@ -11,6 +11,7 @@ again at the batch solution. A large correction, such as a position fix after a 
 
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import compress
 from typing import Annotated, Any, Literal, NamedTuple, Protocol
 
 import gtsam
@@ -176,7 +177,8 @@ class Estimates:
 
     def is_taken_up(self, key: int) -> bool:
         """True for a variable that is in the window, not only about to be."""
-        return self.exists(key) and not self.new.exists(key)
+        is_held = self._window is not None and key not in self._gone and self._window.holds(key)
+        return is_held and not self.new.exists(key)
 
     def atPose3(self, key: int) -> gtsam.Pose3:
         """Pose of a keyframe; the name is GTSAM's."""
@@ -191,12 +193,14 @@ class Estimates:
         return self._at(key)
 
     def _at(self, key: int) -> Any:
-        if key not in self._known:
+        known = self._known.get(key)
+        if known is None:
             source = self.new
             if not source.exists(key) and self._window is not None:
                 source = self._window.estimate([key])
-            self._known[key] = source.atPose3(key) if is_pose(key) else source.atVector(key)
-        return self._known[key]
+            known = source.atPose3(key) if is_pose(key) else source.atVector(key)
+            self._known[key] = known
+        return known
 
     def all(self) -> gtsam.Values:
         """All variables, as a copy."""
@@ -645,9 +649,7 @@ class Smoother:
         position_m = self.estimates.atPose3(self._newest_pose).translation()
         points_m = [(new if new.exists(key) else linearised_at).atPoint3(key) for key in self._landmarks]
         distances_m = np.linalg.norm(np.array(points_m) - position_m, axis=1)
-        return [
-            key for key, distance_m in zip(self._landmarks, distances_m.tolist(), strict=True) if distance_m <= reach_m
-        ]
+        return list(compress(self._landmarks, (distances_m <= reach_m).tolist()))
 
     def joint_covariance_of_any(self, keys: list[int]) -> JointCovariance:
         """Joint marginal covariance of any variables, from the batch solution if one has left the window."""

@@ -8,6 +8,7 @@ slower: a window changes to QR when Cholesky has failed, and stays with it (docs
 """
 
 from collections.abc import Container, Iterable, Mapping, Sequence
+from itertools import islice
 from typing import Any, NamedTuple
 
 import gtsam
@@ -99,7 +100,7 @@ class WholeWindow:
         result = self.isam.update(graph_of(new.values()), values, params)
         indices = iter(result.getNewFactorsIndices())
         for handle, group in new.items():
-            self._slots[handle] = [next(indices) for _ in group]
+            self._slots[handle] = list(islice(indices, len(group.factors)))
 
     def holds(self, key: int) -> bool:
         """True for a variable in the window."""
