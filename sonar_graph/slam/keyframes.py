@@ -53,7 +53,8 @@ FIX_GAIN = 50.0
 wait for the next keyframe unless together they would cut the position variance by more than 10 %."""
 LEAST_BIAS_SHARE = 0.01
 """Variance of a fix from the biases of the motion to it, as a share of its noise, from which the fix constrains the
-biases too. Gaps exceed it. Below it a factor on the keyframe alone is used, which is compiled."""
+biases too. Gaps exceed it. Below it a factor on the keyframe alone is used, which is compiled
+(`benchmarks/validation/isam2_constants.py`)."""
 EARLIEST_NS = np.iinfo(np.int64).min
 LATEST_NS = np.iinfo(np.int64).max
 

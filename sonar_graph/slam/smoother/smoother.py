@@ -54,7 +54,8 @@ MOST_STEPS = 4
 MOST_SETTLING_STEPS = 10
 """The same after an exchange of factors, which may move the estimate far."""
 REACH = 1.5
-"""Distance of landmarks, in longest ranges, up to which the next frame may show them: the vehicle has moved by then."""
+"""Distance of landmarks, in longest ranges, up to which the next frame may show them: the vehicle has moved by then. A
+shorter reach needs a second covariance in many frames (`benchmarks/validation/isam2_constants.py`)."""
 ROUNDING_S = 1e-6
 """Margin for rounded times: a variable exactly as old as the lag stays."""
 

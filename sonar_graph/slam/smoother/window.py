@@ -18,6 +18,9 @@ from sonar_graph.slam.smoother.factor_store import BIAS, LANDMARK, TANGENT_SIZES
 
 NEVER = 1_000_000_000
 """Updates between two relinearisations that iSAM2 would begin by itself."""
+MOST_FILL = 1.5
+"""Growth of the Bayes tree since all variables were last ordered together, from which they are ordered again
+(`benchmarks/validation/isam2_constants.py`)."""
 LAST = 1
 """Group of the variables that are eliminated last; all others are in group 0."""
 Times = Mapping[Any, float]
@@ -52,8 +55,9 @@ class WholeWindow:
     def __init__(self, thresholds: Thresholds, *, is_by_qr: bool = False) -> None:
         params = isam2_params(thresholds, is_by_qr=is_by_qr)
         params.relinearizeSkip = NEVER
-        # each update orders only the variables that it eliminates: over a long run the tree fills up
+        # an update orders only the variables that it eliminates: over a long run the tree fills up
         params.enableAdaptiveReorder = True
+        params.adaptiveReorderThreshold = MOST_FILL
         self.isam = gtsam.ISAM2(params)
         self.linearised_at = self.isam.getLinearizationPoint()
         """Linearisation point of every variable.
