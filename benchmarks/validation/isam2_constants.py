@@ -2,8 +2,8 @@
 
 * ``REACH``, ``MOST_FILL``: a survey of 200 landmarks that is repeated every nine minutes (`dense_log.py`). Processor
   seconds of all calls and of the last ten minutes, and joint covariances that were computed for each sonar frame.
-* ``LEAST_BIAS_SHARE``: runs over a Doppler gap with position fixes (`gap_fixes.py`). Processor seconds, root mean square
-  of the causal error (m), and normalised squared error of the causal position, divided by its 3 dimensions.
+* ``LEAST_BIAS_SHARE``: runs over a Doppler gap with position fixes (`gap_fixes.py`). Processor seconds, root mean
+  square of the causal error (m), and normalised squared error of the causal position, divided by its 3 dimensions.
 
 There is no target.
 """

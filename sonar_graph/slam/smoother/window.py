@@ -45,6 +45,7 @@ def isam2_params(thresholds: Thresholds, *, is_by_qr: bool) -> gtsam.ISAM2Params
     params = gtsam.ISAM2Params()
     params.setFactorization("QR" if is_by_qr else "CHOLESKY")
     params.setRelinearizeThreshold(by_kind)
+    # else the slots of removed factors stay empty, and their number grows with the run
     params.findUnusedFactorSlots = True
     return params
 
@@ -89,6 +90,7 @@ class WholeWindow:
             Variables to eliminate last. They form the root of the Bayes tree. A covariance is computed along the path
             from the root to its variables, which has one clique then instead of up to fifty.
         """
+        # GTSAM would put the variables of new factors last, and in an update without new factors none
         params = gtsam.ISAM2UpdateParams()
         params.removeFactorIndices = [slot for handle in removed for slot in self._slots.pop(handle)]
         params.force_relinearize = relinearises
@@ -114,6 +116,7 @@ class WholeWindow:
         """Largest component by which some variables have moved from their linearisation point, rad or m."""
         if not keys:
             return 0.0
+        # GTSAM returns a reference, not a copy
         return float(np.abs(self.isam.getDelta().vector(keys)).max())
 
     def estimate(self, keys: Sequence[int] | None = None) -> gtsam.Values:
@@ -136,6 +139,7 @@ class FixedLagWindow:
 
     def __init__(self, thresholds: Thresholds, lag_s: float, *, is_by_qr: bool = False) -> None:
         self._params = isam2_params(thresholds, is_by_qr=is_by_qr)
+        # the window is small: every update may relinearise
         self._params.relinearizeSkip = 1
         self._is_by_qr = is_by_qr
         self._begin_empty(lag_s)
@@ -171,6 +175,7 @@ class FixedLagWindow:
                 inside.add(factor)
             else:
                 outside.add(factor)
+        # these factors also constrain the kept variables
         if outside.size():
             for factor in marginal(outside, values, times_s, is_by_qr=self._is_by_qr):
                 inside.add(factor)
@@ -224,10 +229,12 @@ class FixedLagWindow:
         present = self._fixed_lag.getFactors()
         graph = gtsam.NonlinearFactorGraph()
         for i in range(present.size()):
+            # an empty slot: its factor was marginalised or removed
             if not present.exists(i):
                 continue
             factor = present.at(i)
             if isinstance(factor, gtsam.LinearContainerFactor):
+                # without a linearisation point it could not be relinearised elsewhere
                 graph.add(gtsam.LinearContainerFactor(factor.linearize(self.linearised_at), self.linearised_at))
             else:
                 graph.add(factor)
