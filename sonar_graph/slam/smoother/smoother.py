@@ -487,9 +487,7 @@ class Smoother:
                 window.update(store.new, self.estimates.new, times_s, lag_s, removed=self._removed)
         except RuntimeError:
             if not self._go_without(time_s):
-                # no new factor is to blame: Cholesky failed on a pose that is far less certain than its step
-                self._is_by_qr = True
-                self._restart(time_s)
+                self._give_up_cholesky(time_s)
             return False
         self._clear_new()
         return True
@@ -624,6 +622,11 @@ class Smoother:
                 values.erase(key)
         self._begin(self.graph, values, time_s)
         return True
+
+    def _give_up_cholesky(self, time_s: float) -> None:
+        """Continue by QR: Cholesky failed on a pose that is far less certain than its step."""
+        self._is_by_qr = True
+        self._restart(time_s)
 
     def _before_update(self) -> gtsam.Values:
         """Values before a failed or diverged update: the linearisation point, near the last good estimate."""
