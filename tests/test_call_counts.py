@@ -20,7 +20,7 @@ from sonar_graph.measurements import Measurements
 from sonar_graph.simulation import MissionOptions, simulate_mission
 
 # Calls for each sonar frame. To accept a new number, write the measured one here.
-ACCEPTED = {"dead-reckoning": 167.3, "ekf-slam": 126.9, "invariant-ekf": 170.7, "isam2": 342.9}
+ACCEPTED = {"dead-reckoning": 167.3, "ekf-slam": 126.9, "invariant-ekf": 170.7, "isam2": 323.5}
 MOST_GROWTH = 1.1
 """A count may grow by a tenth."""
 NOT_COUNTED = ("<listcomp>", "<dictcomp>", "<setcomp>")

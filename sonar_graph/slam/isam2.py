@@ -160,14 +160,17 @@ class Isam2:
         None before IMU and DVL have begun, and for an instant before that of an earlier call.
         """
         require_measurements(measurements, "isam2")
+        # motion first: frames and fixes of the same call are predicted with it
         self._keyframes.add(measurements.imu, measurements.dvl, measurements.depth, measurements.heading)
         events = self._fix_events(measurements.positions)
         is_late = self._poses.newest_ns is not None and measurements.end_ns < self._poses.newest_ns
         if is_late:
+            # a fix may be tied to an earlier keyframe, but the motion to an earlier frame is no longer kept
             for event in events:
                 event.apply()
             self._refuse_late(measurements.detections)
             return None
+        # frames before fixes of the same stamp, because the sort is stable
         events = self._frame_events(measurements.detections) + events
         for event in sorted(events, key=lambda event: event.stamp_ns):
             self._frontend.advance(event.stamp_ns)
@@ -180,6 +183,7 @@ class Isam2:
 
     def _estimate(self, stamp_ns: int) -> Estimate:
         """Estimate at an instant: the newest keyframe's pose, carried on by odometry."""
+        # provisional: no keyframe is set here, so that results do not depend on when an estimate is wanted
         instant = AnchoredPose(stamp_ns, self._keyframes.tie(self._keyframes.motion_since_newest(stamp_ns)))
         self._poses.add(instant)
         joint = self._smoother.joint_covariance(instant.tie.keys)
@@ -203,6 +207,7 @@ class Isam2:
                 self._keyframes.refuse("positions", stamp_ns, Refusal.UNSOUND)
                 continue
             cov_m2 = positions.covariance_m2[k]
+            # the receiver gave none: the calibration's noise holds
             if np.isnan(cov_m2).any():
                 cov_m2 = np.diag(np.square(known.sigma_m))
             events.append(Event(stamp_ns, partial(self._frontend.add_fix, stamp_ns, positions.position_m[k], cov_m2)))
@@ -339,6 +344,7 @@ class Isam2:
         Doubtful identities are those that fit the whole history best, chosen beside the run, which asking leaves as it
         was.
         """
+        # kept by the smoother until factors are added: map and trajectory are of one solution
         values, marginals, _ = self._frontend.smoothed()
         return self._poses.trajectory(values, marginals)
 
@@ -352,6 +358,7 @@ class Isam2:
         Covariances are those of `joint_covariance` over the window.
         """
         smoother = self._smoother
+        # a landmark that came with the last frame may wait for the next update
         ids = [i for i in smoother.landmark_ids if smoother.in_window([L(i)])]
         return map_of(smoother.estimates, smoother.marginals, ids)
 

@@ -54,7 +54,8 @@ FIX_GAIN = 50.0
 wait for the next keyframe unless together they would cut the position variance by more than 10 %."""
 LEAST_BIAS_SHARE = 0.01
 """Variance of a fix from the biases of the motion to it, as a share of its noise, from which the fix constrains the
-biases too. Gaps exceed it. Below it a factor on the keyframe alone is used, which is compiled."""
+biases too. Gaps exceed it. Below it a factor on the keyframe alone is used, which is compiled
+(`benchmarks/validation/isam2_constants.py`)."""
 EARLIEST_NS = np.iinfo(np.int64).min
 LATEST_NS = np.iinfo(np.int64).max
 
@@ -289,12 +290,13 @@ class Keyframes:
             self._start(start_ns)
             changes.append(self._updated())
         interval_ns = round(self.params.max_interval_s * NS_PER_S)
-        while True:
+        while until_ns >= self.stamps_ns[-1] + interval_ns:
             due_ns = self.odometry.epochs(self.stamps_ns[-1] + interval_ns - 1, until_ns)
             if not len(due_ns):
-                return changes
+                break
             self._set(int(due_ns[0]), until_ns)
             changes.append(self._updated())
+        return changes
 
     def _updated(self) -> Changed:
         changed = self.smoother.update(self.newest_s)

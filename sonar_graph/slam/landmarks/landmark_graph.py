@@ -279,9 +279,10 @@ class LandmarkGraph:
                     added.append(each)
                 else:
                     associated.append((each.sighting, each.landmark_id))
-            self._states[each.sighting] = state._replace(outcome=each.outcome)
-            if each.outcome not in LATER:
-                del self._states[each.sighting]
+            if each.outcome in LATER:
+                self._states[each.sighting] = State(each.outcome, state.landmark_id, state.handle)
+            else:
+                self._states.pop(each.sighting, None)
         # before an exchange, which enters what waits
         for each in added:
             self._add(each)
@@ -386,7 +387,7 @@ class LandmarkGraph:
         return min(self._of.get(landmark_id, {}), key=lambda s: (s.stamp_ns, s.row), default=None)
 
     def _insert(self, sighting: Sighting, landmark_id: int, handle: int | None) -> None:
-        self._states[sighting] = self.state(sighting)._replace(landmark_id=landmark_id, handle=handle)
+        self._states[sighting] = State(self.state(sighting).outcome, landmark_id, handle)
         self._of[landmark_id][sighting] = None
 
     def _remove(self, sighting: Sighting) -> None:

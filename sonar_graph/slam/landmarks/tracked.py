@@ -204,7 +204,8 @@ class TrackedIdentities(IdentityPolicy):
         judged = self._compared(seen, known) if known else []
         judged += [self._begun(seen, row) for row in named if row not in known]
         others = [row for row in range(len(frame)) if frame.refusals[row] is not None]
-        for row, sighting in zip(others, seen.sightings(others, seen.beam_points(others)), strict=True):
+        waiting = seen.sightings(others, seen.beam_points(others)) if others else []
+        for row, sighting in zip(others, waiting, strict=True):
             # repeated: a more probable row of the frame has the landmark
             is_repeated = frame.refusals[row] is Outcome.REPEATED
             judged.append(Assignment(sighting, Outcome.REPEATED if is_repeated else Outcome.WAITING))
@@ -317,7 +318,7 @@ class TrackedIdentities(IdentityPolicy):
         compared = seen.view.compare(keys, landmarks, frame.z[rows], frame.noise[rows])
         # a sighting of a track may change its landmark, so that its noise must not depend on one
         is_tracked = frame.detections.track[rows] != NO_TRACK
-        points = np.where(is_tracked[:, None], seen.beam_points(rows), landmarks)
+        points = np.where(is_tracked[:, None], seen.beam_points(rows), landmarks) if is_tracked.any() else landmarks
         judged = []
         for k, sighting in enumerate(seen.sightings(rows, points)):
             is_inside = bool(compared.distance[k] <= self._gate)

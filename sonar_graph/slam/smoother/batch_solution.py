@@ -103,6 +103,7 @@ def descended(graph: gtsam.NonlinearFactorGraph, initial: gtsam.Values, most_ste
     while tried < most_steps:
         linear = stacked.linearize(values)
         if ordering is None:
+            # all linear graphs of a descent have the same structure
             ordering = gtsam.Ordering.ColamdGaussianFactorGraph(linear)
         step = None
         growth = DAMPING_FACTOR
@@ -110,10 +111,12 @@ def descended(graph: gtsam.NonlinearFactorGraph, initial: gtsam.Values, most_ste
             tried += 1
             step = lowering_step(stacked, linear, values, error, damping, ordering)
             if step is None:
+                # the least damping is far below the useful ones: reach them in a few attempts
                 damping *= growth
                 growth *= DAMPING_FACTOR
         if step is None:
             break
+        # near the solution undamped steps converge quadratically
         damping = max(damping / DAMPING_FACTOR, FIRST_DAMPING)
         before = error
         values, error = doubled(stacked, values, step)
@@ -147,6 +150,7 @@ def doubled(stacked: StackedGraph, values: gtsam.Values, step: gtsam.VectorValue
         step = step.scale(2.0)
         further = values.retract(step)
         further_error = stacked.error(further)
+        # not < : stop where the error is no number
         if not further_error < error:
             return reached, error
         reached = further
@@ -164,6 +168,7 @@ def damped_step(
 ) -> gtsam.VectorValues:
     """Step of a linear graph with ``damping`` times the identity in its information."""
     damped = linear
+    # the least damping is negligible: solve the graph as it is
     if damping > FIRST_DAMPING:
         damped = linear.clone()
         for key in linear.keyVector():
@@ -236,6 +241,7 @@ def solve_in_sight(graph: gtsam.NonlinearFactorGraph, initial: gtsam.Values, sig
             break
         retried = descended(graph, placed_again(best.values, sightlines, stuck), steps_left)
         steps_left -= retried.steps
+        # the new starts do not help: most sightings of these landmarks are wrong
         if retried.error >= best.error:
             break
         best = retried
@@ -284,6 +290,7 @@ class KeptCovariance:
         self, marginals: Marginals | gtsam.ISAM2, keys: list[int], likely: Callable[[], list[int]]
     ) -> JointCovariance:
         """Joint covariance of these variables, and possibly of more; ``likely`` names those asked for next."""
+        # the next joint covariance includes all variables since the update, so that no question is repeated
         self._asked.update(keys)
         if self._joint is None or not self._joint.rows.keys() >= self._asked:
             self._joint = JointCovariance.of(marginals, sorted(self._asked.union(likely())))
@@ -318,6 +325,7 @@ class Marginals:
         return self._ask(lambda marginals: marginals.jointMarginalCovariance(keys))
 
     def _ask(self, question: Callable[[gtsam.Marginals | gtsam.ISAM2], Any]) -> Any:
+        # QR is slower
         if self._by_cholesky is not None:
             with suppress(RuntimeError):
                 return question(self._by_cholesky)

@@ -151,11 +151,14 @@ class FactorStore:
         for factor in group:
             self.new_graph.add(factor)
         if group.seen is not None:
+            # most groups are sightings: do not search the keys of their factors
             lasting = [group.seen[1].pose_key]
         else:
             keys = {key for factor in group for key in list(factor.keys())}
             poses = [key for key in keys if is_pose(key)]
+            # landmarks never leave; biases outlive the poses that they hold for
             lasting = poses or [key for key in keys if not is_landmark(key)]
+        # a factor on landmarks alone stays
         if lasting:
             self._leaving_with[min(lasting)].append(handle)
         return handle
@@ -166,6 +169,7 @@ class FactorStore:
             self.new.pop(handle, None)
             group = self.groups.pop(handle)
             self.gone.update(group)
+        # GTSAM's graph would keep a hole
         self.new_graph = graph_of(self.new.values())
 
     def leave(self, keys: Iterable[int]) -> list[int]:

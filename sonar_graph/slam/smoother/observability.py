@@ -74,8 +74,10 @@ def left_open(
         return []
     factors = [factor for factor in map(graph.at, range(graph.size())) if not places.keys().isdisjoint(factor.keys())]
     A = np.vstack([np.zeros((1, size)), *(_rows(factor, values, places, least_said) for factor in factors)])
+    # such a factor is reported as spoilt
     if not np.isfinite(A).all():
         return []
+    # radians and metres beside each other: the rank must not depend on their units
     lengths = np.linalg.norm(A, axis=0)
     scale = 1.0 / np.where(lengths > 0, lengths, 1.0)
     _, s, V = np.linalg.svd(np.linalg.qr(A * scale, mode="r"), full_matrices=True)
@@ -137,6 +139,7 @@ class Blame:
 
     def spoilt(self, values: gtsam.Values) -> list[Withheld]:
         """New factors whose error is no number."""
+        # one call in the usual case; each factor only where the sum is no number
         if np.isfinite(self.graph.error(values)):
             return []
         return [
@@ -163,6 +166,7 @@ class Blame:
         """
         graph, inside = gtsam.NonlinearFactorGraph(window), {*window.keyVector(), *self._new_keys}
         for factor in map(self.graph.at, range(self.graph.size())):
+            # a new factor may be on a variable that has left the window
             if inside.issuperset(factor.keys()):
                 graph.add(factor)
         found: list[Withheld] = []
@@ -170,6 +174,7 @@ class Blame:
             if gtsam.symbolChr(open_.key) == ord("x") or open_.key not in self._new_keys:
                 raise EstimatorError(f"isam2: {self._explained(open_, self._labelled(graph, open_.key))}")
             found.append(self._without(open_))
+        # nothing is open, so that only weak factors can be to blame
         return found or self.undetermined(values, LEAST_SAID)
 
     def reasons(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> str:

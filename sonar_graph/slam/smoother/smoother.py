@@ -11,6 +11,7 @@ again at the batch solution. A large correction, such as a position fix after a 
 
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import compress
 from typing import Annotated, Any, Literal, NamedTuple, Protocol
 
 import gtsam
@@ -52,7 +53,8 @@ MOST_STEPS = 4
 MOST_SETTLING_STEPS = 10
 """The same after an exchange of factors, which may move the estimate far."""
 REACH = 1.5
-"""Distance of landmarks, in longest ranges, up to which the next frame may show them: the vehicle has moved by then."""
+"""Distance of landmarks, in longest ranges, up to which the next frame may show them: the vehicle has moved by then. A
+shorter reach needs a second covariance in many frames (`benchmarks/validation/isam2_constants.py`)."""
 ROUNDING_S = 1e-6
 """Margin for rounded times: a variable exactly as old as the lag stays."""
 
@@ -190,12 +192,15 @@ class Estimates:
         return self._at(key)
 
     def _at(self, key: int) -> Any:
-        if key not in self._known:
+        # a frame uses the same few variables several times
+        known = self._known.get(key)
+        if known is None:
             source = self.new
             if not source.exists(key) and self._window is not None:
                 source = self._window.estimate([key])
-            self._known[key] = source.atPose3(key) if is_pose(key) else source.atVector(key)
-        return self._known[key]
+            known = source.atPose3(key) if is_pose(key) else source.atVector(key)
+            self._known[key] = known
+        return known
 
     def all(self) -> gtsam.Values:
         """All variables, as a copy."""
@@ -203,6 +208,7 @@ class Estimates:
         if self._window is None:
             return values
         estimate = self._window.estimate()
+        # the window still has them: only its next update removes their factors
         for key in self._gone:
             estimate.erase(key)
         values.insert(estimate)
@@ -279,6 +285,7 @@ class Smoother:
             return self._store.graph()
         graph = gtsam.NonlinearFactorGraph()
         for factor in (self._taken_up.at(i) for i in range(self._taken_up.size())):
+            # removed by an exchange, which the window has not made yet
             if factor not in self._store.gone:
                 graph.add(factor)
         graph.push_back(self._store.new_graph)
@@ -310,6 +317,7 @@ class Smoother:
                 " give keyframes in the order of time"
             )
         self._insert(key, pose)
+        # covariances, iteration and the test for divergence use the newest keyframe
         self._newest_pose = key
         self._newest_s = time_s
         self._times_s[key] = time_s
@@ -335,8 +343,10 @@ class Smoother:
         ``gain``: expected information, predicted variance over noise variance.
         """
         self._waiting_gain += gain
+        # the batch solution lacks these factors
         self._solved = None
         if seen is not None:
+            # stands for the range of the sonar, which the calibration does not contain
             self._longest_range_m = max(self._longest_range_m, float(seen[1].z[0]))
         return self._store.add(FactorGroup(factors, seen))
 
@@ -353,6 +363,7 @@ class Smoother:
 
     def update(self, time_s: float) -> Changed:
         """Update the window with all that was added; variables older than the lag leave a bounded one."""
+        # where all that was new is withheld there is nothing to update
         if not self._withhold_unusable() or self.is_due:
             self._update(time_s, self._lag_at(time_s))
         return self._changed()
@@ -379,6 +390,7 @@ class Smoother:
 
         New landmarks come with first estimates. Lost are the landmarks that keep no factor.
         """
+        # handles of removed groups must be known to the window
         self._flush(time_s)
         self._store.remove(removed)
         self._removed.extend(removed)
@@ -392,6 +404,7 @@ class Smoother:
             self._restart(time_s)
         else:
             self._update(time_s, self._lag_that_keeps_all(time_s))
+            # a changed identity may move the estimate farther than one step reaches
             self.settle(time_s)
         return self._changed(handles)
 
@@ -425,12 +438,14 @@ class Smoother:
         """Update the window with all that is new, and iterate after a large step."""
         self._solved = None  # an earlier question must not decide where the next batch solution starts
         relinearises = time_s >= self._relinearised_s + self.params.relinearize_interval_s
+        # GTSAM counts updates, but their rate depends on what the sonar sees
         if relinearises:
             self._relinearised_s = time_s
         is_solved = self._step(time_s, lag_s, relinearises=relinearises)
         if not is_solved:
             return
         self._iterate(time_s, MOST_STEPS, LEAST_ITERATED)
+        # marginals of a bounded window stay linearised where their poses left
         if isinstance(self._window, FixedLagWindow):
             may_restart = time_s >= self._restarted_s + self.params.lag_s
             if may_restart and self._window.largest_shift(self._landmarks) > self.params.stale_shift_m:
@@ -440,11 +455,13 @@ class Smoother:
         """Further Gauss-Newton steps while the last one was large (rad or m); a restart where they diverge."""
         for _ in range(most_steps):
             step = self._largest_step()
+            # not <= : also where the step is no number
             if not step <= LEAST_SUSPICIOUS and self._has_diverged():
                 self._restart(time_s)
                 return
             if step <= least:
                 return
+            # old variables left in the first step of this update: keep the others
             is_solved = self._step(time_s, self._lag_that_keeps_all(time_s), relinearises=True)
             if not is_solved:
                 return
@@ -455,8 +472,15 @@ class Smoother:
         store = self._store
         try:
             if isinstance(window, WholeWindow):
-                window.update(store.new, self.estimates.new, removed=self._removed, relinearises=relinearises)
+                window.update(
+                    store.new,
+                    self.estimates.new,
+                    removed=self._removed,
+                    relinearises=relinearises,
+                    last=self._asked_next(),
+                )
             else:
+                # their covariances exist only before the update
                 self._take_leave(time_s - lag_s)
                 times_s = self._used_at(time_s)
                 window.update(store.new, self.estimates.new, times_s, lag_s, removed=self._removed)
@@ -491,6 +515,7 @@ class Smoother:
         graph = self.graph
         error_before = graph.error(self._window.linearised_at)
         error_after = graph.error(self.estimates.all())
+        # an error that is no number has increased too
         return not error_after <= error_before
 
     def _restart(self, time_s: float) -> None:
@@ -502,6 +527,7 @@ class Smoother:
 
     def _begin(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, time_s: float) -> None:
         """Begin a new window with all groups of factors at given values; `EstimatorError` where that is impossible."""
+        # QR last: it refuses only what is not determined
         for is_by_qr in (self._is_by_qr, True):
             self._is_by_qr = is_by_qr
             window = self._empty_window()
@@ -533,6 +559,7 @@ class Smoother:
     def _take_leave(self, oldest_s: float) -> None:
         """Let `Departures` take note of the variables that the next update marginalises."""
         leaving = {key for key, t in self._times_s.items() if t < oldest_s and not self.estimates.new.exists(key)}
+        # the biases in use are older than the poses that they hold for
         leaving.discard(self._newest_bias)
         if leaving and self._departures is not None:
             self._departures.leave(leaving, self.estimates, self.marginals)
@@ -555,6 +582,7 @@ class Smoother:
     def _withhold_unusable(self) -> bool:
         """Withhold new factors with which the window could not be solved; True if there were any."""
         blame = self._blame()
+        # only the variables of new factors: their number does not grow with the run
         keys = blame.graph.keyVector()
         values = picked(self.estimates, keys)
         spoilt = blame.spoilt(values)
@@ -571,19 +599,18 @@ class Smoother:
             handles = withheld.handles.intersection(self._store.new)
             self._refused |= handles
             self._store.remove(handles)
-            for key in withheld.keys:
-                self.estimates.forget(key)
-                if key in self._landmarks:
-                    self._landmarks.remove(key)
+            self._forget(withheld.keys)
 
-    def _forget(self, landmark_keys: Iterable[int]) -> None:
-        for key in landmark_keys:
-            self._landmarks.remove(key)
+    def _forget(self, keys: Iterable[int]) -> None:
+        for key in keys:
             self.estimates.forget(key)
+            if key in self._landmarks:
+                self._landmarks.remove(key)
 
     def _go_without(self, time_s: float) -> bool:
         """Solve the window without the new factors that made its update fail; True if there were any."""
         values = self._before_update()
+        # the window was solved without the new factors, so that the fault is in them
         before = self._taken_up if self.is_bounded else self._store.graph(left_out=self._store.new)
         found = self._blame().culprits(before, values)
         if not found:
@@ -598,9 +625,7 @@ class Smoother:
     def _give_up_cholesky(self, time_s: float) -> None:
         """Continue by QR: Cholesky failed on a pose that is far less certain than its step."""
         self._is_by_qr = True
-        graph = self.graph
-        values = solve_in_sight(graph, self._before_update(), self._store.sightlines())
-        self._begin(graph, values, time_s)
+        self._restart(time_s)
 
     def _before_update(self) -> gtsam.Values:
         """Values before a failed or diverged update: the linearisation point, near the last good estimate."""
@@ -617,18 +642,30 @@ class Smoother:
 
     def joint_covariance(self, keys: list[int]) -> JointCovariance:
         """Joint marginal covariance of variables in the window, and possibly of more of them."""
-        return self._kept_covariance.of(self.marginals, keys, self._landmarks_in_reach)
+        return self._kept_covariance.of(self.marginals, keys, self._likely)
+
+    def _likely(self) -> list[int]:
+        """Landmarks in the window that the next frame may show."""
+        return [key for key in self._landmarks_in_reach() if self.estimates.is_taken_up(key)]
+
+    def _asked_next(self) -> list[int]:
+        """Variables whose covariance will be asked for: newest keyframe and biases, and landmarks in reach."""
+        # first factors may have been withheld together with their variable
+        newest = [key for key in (self._newest_pose, self._newest_bias) if key is not None]
+        return self.in_window(newest) + self._landmarks_in_reach()
 
     def _landmarks_in_reach(self) -> list[int]:
         """Landmarks within `REACH` times the longest range measured so far from the newest keyframe."""
         if self._newest_pose is None or not self._landmarks:
             return []
-        known = [key for key in self._landmarks if self.estimates.is_taken_up(key)]
         reach_m = REACH * self._longest_range_m
+        new = self.estimates.new
+        # within the relinearisation threshold of the estimate, and known without back-substitution
+        linearised_at = self._window.linearised_at
         position_m = self.estimates.atPose3(self._newest_pose).translation()
-        points_m = np.array([self.estimates.atPoint3(key) for key in known]).reshape(-1, 3)
-        distances_m = np.linalg.norm(points_m - position_m, axis=1)
-        return [key for key, distance_m in zip(known, distances_m, strict=True) if distance_m <= reach_m]
+        points_m = [(new if new.exists(key) else linearised_at).atPoint3(key) for key in self._landmarks]
+        distances_m = np.linalg.norm(np.array(points_m) - position_m, axis=1)
+        return list(compress(self._landmarks, (distances_m <= reach_m).tolist()))
 
     def joint_covariance_of_any(self, keys: list[int]) -> JointCovariance:
         """Joint marginal covariance of any variables, from the batch solution if one has left the window."""

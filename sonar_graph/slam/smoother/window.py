@@ -8,6 +8,7 @@ slower: a window changes to QR when Cholesky has failed, and stays with it (docs
 """
 
 from collections.abc import Container, Iterable, Mapping, Sequence
+from itertools import islice
 from typing import Any, NamedTuple
 
 import gtsam
@@ -17,6 +18,11 @@ from sonar_graph.slam.smoother.factor_store import BIAS, LANDMARK, TANGENT_SIZES
 
 NEVER = 1_000_000_000
 """Updates between two relinearisations that iSAM2 would begin by itself."""
+MOST_FILL = 1.5
+"""Growth of the Bayes tree since all variables were last ordered together, from which they are ordered again
+(`benchmarks/validation/isam2_constants.py`)."""
+LAST = 1
+"""Group of the variables that are eliminated last; all others are in group 0."""
 Times = Mapping[Any, float]
 """Time (s) at which a variable was last used, by key."""
 
@@ -39,6 +45,7 @@ def isam2_params(thresholds: Thresholds, *, is_by_qr: bool) -> gtsam.ISAM2Params
     params = gtsam.ISAM2Params()
     params.setFactorization("QR" if is_by_qr else "CHOLESKY")
     params.setRelinearizeThreshold(by_kind)
+    # else the slots of removed factors stay empty, and their number grows with the run
     params.findUnusedFactorSlots = True
     return params
 
@@ -49,6 +56,9 @@ class WholeWindow:
     def __init__(self, thresholds: Thresholds, *, is_by_qr: bool = False) -> None:
         params = isam2_params(thresholds, is_by_qr=is_by_qr)
         params.relinearizeSkip = NEVER
+        # an update orders only the variables that it eliminates: over a long run the tree fills up
+        params.enableAdaptiveReorder = True
+        params.adaptiveReorderThreshold = MOST_FILL
         self.isam = gtsam.ISAM2(params)
         self.linearised_at = self.isam.getLinearizationPoint()
         """Linearisation point of every variable.
@@ -68,16 +78,35 @@ class WholeWindow:
         *,
         removed: Iterable[int],
         relinearises: bool,
+        last: Iterable[int] = (),
     ) -> None:
         """Add groups of factors by their handles, with new variables, and remove others.
 
-        ``relinearises``: move the linearisation point of each variable whose change exceeds the threshold.
+        Parameters
+        ----------
+        relinearises
+            True: move the linearisation point of each variable whose change exceeds the threshold.
+        last
+            Variables to eliminate last. They form the root of the Bayes tree. A covariance is computed along the path
+            from the root to its variables, which has one clique then instead of up to fifty.
         """
-        slots = [slot for handle in removed for slot in self._slots.pop(handle)]
-        result = self.isam.update(graph_of(new.values()), values, slots, None, None, None, relinearises)
+        # GTSAM would put the variables of new factors last, and in an update without new factors none
+        params = gtsam.ISAM2UpdateParams()
+        params.removeFactorIndices = [slot for handle in removed for slot in self._slots.pop(handle)]
+        params.force_relinearize = relinearises
+        groups = gtsam.KeyGroupMap()
+        eliminated_again = gtsam.KeyList()
+        for key in last:
+            groups.insert2(key, LAST)
+            if not values.exists(key):
+                # GTSAM orders only what it eliminates
+                eliminated_again.push_back(key)
+        params.constrainedKeys = groups
+        params.extraReelimKeys = eliminated_again
+        result = self.isam.update(graph_of(new.values()), values, params)
         indices = iter(result.getNewFactorsIndices())
         for handle, group in new.items():
-            self._slots[handle] = [next(indices) for _ in group]
+            self._slots[handle] = list(islice(indices, len(group.factors)))
 
     def holds(self, key: int) -> bool:
         """True for a variable in the window."""
@@ -87,8 +116,8 @@ class WholeWindow:
         """Largest component by which some variables have moved from their linearisation point, rad or m."""
         if not keys:
             return 0.0
-        step = picked(self.linearised_at, keys).localCoordinates(self.estimate(keys))  # getDelta() solves for all
-        return float(np.abs(step.vector(keys)).max())
+        # GTSAM returns a reference, not a copy
+        return float(np.abs(self.isam.getDelta().vector(keys)).max())
 
     def estimate(self, keys: Sequence[int] | None = None) -> gtsam.Values:
         """Estimate of some variables, or of all."""
@@ -110,6 +139,7 @@ class FixedLagWindow:
 
     def __init__(self, thresholds: Thresholds, lag_s: float, *, is_by_qr: bool = False) -> None:
         self._params = isam2_params(thresholds, is_by_qr=is_by_qr)
+        # the window is small: every update may relinearise
         self._params.relinearizeSkip = 1
         self._is_by_qr = is_by_qr
         self._begin_empty(lag_s)
@@ -145,6 +175,7 @@ class FixedLagWindow:
                 inside.add(factor)
             else:
                 outside.add(factor)
+        # these factors also constrain the kept variables
         if outside.size():
             for factor in marginal(outside, values, times_s, is_by_qr=self._is_by_qr):
                 inside.add(factor)
@@ -198,10 +229,12 @@ class FixedLagWindow:
         present = self._fixed_lag.getFactors()
         graph = gtsam.NonlinearFactorGraph()
         for i in range(present.size()):
+            # an empty slot: its factor was marginalised or removed
             if not present.exists(i):
                 continue
             factor = present.at(i)
             if isinstance(factor, gtsam.LinearContainerFactor):
+                # without a linearisation point it could not be relinearised elsewhere
                 graph.add(gtsam.LinearContainerFactor(factor.linearize(self.linearised_at), self.linearised_at))
             else:
                 graph.add(factor)
